@@ -14,6 +14,7 @@ import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
 import bhd_lerobot.ros2.robots.config_robot
 import bhd_lerobot.tasks.avoid
+import bhd_lerobot.tasks.fetch
 import bhd_lerobot.tasks.navigate
 import bhd_lerobot.tasks.pick
 import bhd_lerobot.tasks.reach  # noqa: F401  as the others above, registers its configuration
@@ -27,6 +28,7 @@ from bhd_lerobot.policies.brain import Brain, BrainConfig, ConfiguredBrain
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig, check_drivers
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.learned.brain import LearnedBrain
+from bhd_lerobot.policies.manipulation.fetch import FetchBrain
 from bhd_lerobot.policies.manipulation.pick import PickBrain
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
 from bhd_lerobot.policies.manipulation.servo import PickServoBrain, ReachServoBrain
@@ -85,8 +87,8 @@ ROBOTS: Registry[Any] = Registry("robot", _SIMULATIONS, RobotConfig)
 """The classes of the robots' simulations, by type; those of this package import MuJoCo."""
 
 _CLASSES: tuple[Any, ...] = (
-    *(AvoidanceBrain, _Blanked, _Dagger, GapFollowerBrain, LanguageBrain, LearnedBrain, NavigatorBrain, NoopBrain),
-    *(PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain, TopicBrain),
+    *(AvoidanceBrain, _Blanked, _Dagger, FetchBrain, GapFollowerBrain, LanguageBrain, LearnedBrain, NavigatorBrain),
+    *(NoopBrain, PickBrain, PickServoBrain, RandomBrain, ReachBrain, ReachServoBrain, TeleopBrain, TopicBrain),
 )
 BRAINS: Registry[Any] = Registry("brain", {brain.name: brain for brain in _CLASSES}, BrainConfig)
 """The classes of the brains, by name."""

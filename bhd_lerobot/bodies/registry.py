@@ -4,6 +4,7 @@ from collections.abc import Callable, Set
 
 from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.options.plugins import load_plugins
 from bhd_lerobot.options.registry import Registry
@@ -13,6 +14,7 @@ _OWN: dict[str, Callable[[], Body] | str] = {
     "ur5": ur5,
     "arm": ur5,  # stands for the arms that are files
     "so101": "bhd_lerobot.sim.files.arm:so101",
+    "turtlebot3_manipulation": turtlebot3_manipulation,
 }
 OF_FILES = ("arm", "so101")
 """Types whose bodies take seconds to be made."""
@@ -28,9 +30,9 @@ def parts_of_type(robot_type: str) -> Set[type]:
 _unknown: set[str] = set()  # types of robots that no plug-in has; to look for one takes hundredths of a second
 
 
-def body_with(part: type) -> Body:
-    """Return the first body that has a part: the one that stands for a robot that is not known."""
-    return next(body for body in (make() for make in BODIES.values()) if part in body.parts)
+def body_with(*parts: type) -> Body:
+    """Return the first body that has some parts: the one that stands for a robot that is not known."""
+    return next(body for body in (make() for make in BODIES.values()) if body.parts.keys() >= set(parts))
 
 
 def body_of(robot_type: str | None) -> Body | None:

@@ -187,15 +187,25 @@ class Chunk:
     actions: NDArray[np.float64]
 
 
+_NONE = np.zeros(0, np.intp)
+
+
 @dataclass(frozen=True)
 class Goals:
     """Goals for n robots.
 
     Attributes:
         commands: new goals, by simulation; a robot without one continues with its present goal.
+        setpoints: of the robots that follow none, shape (n, actions); rows of NaN for the others. None if all do.
     """
 
     commands: Mapping[int, Sequence[BrainCommand]]
+    setpoints: NDArray[np.float64] | None = None
+
+    @property
+    def streamed(self) -> NDArray[np.intp]:
+        """The robots that have setpoints."""
+        return np.flatnonzero(np.isfinite(self.setpoints).all(axis=1)) if self.setpoints is not None else _NONE
 
 
 Command = NDArray[np.float64] | Chunk | Goals | None

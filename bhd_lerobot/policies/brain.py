@@ -157,7 +157,10 @@ class Brain(Protocol):
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
 
     def act(self, observation: Observation) -> Command:
-        """Return the command of n robots for this frame; a brain returns goals always or never."""
+        """Return the command of n robots for this frame.
+
+        A brain returns goals always or never; among them may be setpoints, for robots that follow none.
+        """
 
     def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations the next `act` uses images; in the others it may get black ones.

@@ -1,6 +1,7 @@
 """The observe-act-record loop: n episodes side by side, each as if it were alone."""
 
 import contextlib
+import itertools
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
@@ -132,6 +133,7 @@ class EpisodeLoop:
         self._scenes: list[Any] = [None] * n
         self._commands: list[list[tuple[int, BrainCommand]]] = [[] for _ in range(n)]
         self._ends: list[list[tuple[int, CommandResult]]] = [[] for _ in range(n)]
+        self._streamed: list[list[int]] = [[] for _ in range(n)]
         self._initial: list[NDArray[np.float64] | None] = [None] * n
         self._images = EpisodeImages(self.robots)
         self.robots.stop(np.arange(n))
@@ -205,7 +207,7 @@ class EpisodeLoop:
         self._results = {sim: results for sim, results in self._results.items() if sim not in ids}
         for sim, spec, scene, state in zip(ids, specs, scenes, states, strict=True):
             self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state
-            self._commands[sim], self._ends[sim] = [], []
+            self._commands[sim], self._ends[sim], self._streamed[sim] = [], [], []
             self._images.sinks[sim] = self._open_images() if self._open_images and self.robots.camera_shapes else None
         self._length[ids] = 0
         self._last_frame = -1
@@ -329,6 +331,8 @@ class EpisodeLoop:
         if isinstance(command, Goals):
             for sim, goals in command.commands.items():
                 self._commands[sim] += [(int(self._length[sim]), goal) for goal in goals]
+            for sim in command.streamed.tolist():
+                self._streamed[sim].append(int(self._length[sim]))
         for sim, results in report.results.items():
             last = int(self._length[sim]) + len(report.missed)
             self._ends[sim] += [(last, result) for result in results]
@@ -405,17 +409,29 @@ class EpisodeLoop:
             writer=writer,
             commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
+            goal_frames=_spans_without(self._streamed[sim], length),
             plan=plan,
             realtime=None if self.robots.clock is None else self.robots.clock.grants,
             interventions=self._drivers.interventions(sim, length),
         )
 
 
+def _spans_without(frames: Sequence[int], length: int) -> list[tuple[int, int]]:
+    """Return the spans, first and end, of what is left of an episode without some frames; none without any of them."""
+    if not frames:
+        return []
+    ends = [-1, *frames, length]
+    return [(first + 1, end) for first, end in itertools.pairwise(ends) if first + 1 < end]
+
+
 def in_single_precision(command: Command) -> Command:
     """Return a command with its setpoints rounded to single precision, as float64; goals are left as they are."""
     match command:
-        case None | Goals():
+        case None | Goals(_, None):
             return command
+        case Goals(_, setpoints):
+            assert setpoints is not None
+            return replace(command, setpoints=_rounded(setpoints))
         case Chunk():
             return replace(command, actions=_rounded(command.actions))
         case _:

@@ -61,7 +61,7 @@ _OF_AN_EPISODE = frozenset(
         *("intervened_frames", "interventions"),
     }
 )
-"""What `episode_metadata` writes besides the task's own details; version 0.3 wrote `goal_frames`, too."""
+"""What `episode_metadata` writes besides the task's own details."""
 
 
 def recorded_episode(recorded: Mapping[str, Any], columns: dict[str, NDArray], instruction: str) -> Episode:
@@ -94,6 +94,8 @@ def _goals(episode: Episode) -> dict[str, Any]:
         columns["results"] = _json(
             [[frame, end.task_id, end.success, end.code.name.lower(), end.message] for frame, end in episode.results]
         )
+        if episode.goal_frames:
+            columns["goal_frames"] = _json(episode.goal_frames)
     return columns
 
 

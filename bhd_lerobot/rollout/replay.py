@@ -129,7 +129,7 @@ class Replay:
             self.goals = {}
             for frame, fields_ in json.loads(metadata["goals"]):
                 self.goals.setdefault(frame, []).append(command_from_json(fields_))
-        # Version 0.3 had episodes that followed goals in some frames, and in the others the recorded actions.
+        # Some episodes followed goals in some frames, and setpoints in the others: the recorded actions.
         self._by_goals = np.full(len(self.columns[keys.ACTION]), self.goals is not None)
         if metadata.get("goal_frames"):
             self._by_goals[:] = False

@@ -35,6 +35,8 @@ class Episode:
         writer: what was given for the episode's images at its start, or None.
         commands: the goals that the brain gave, each with the frame in which it gave it; None if it gave setpoints.
         results: how goals ended, each with the frame in which it did.
+        goal_frames: spans of the frames, first and end, that followed goals while the brain gave setpoints in the
+            others; empty if it gave none.
         plan: the brain's plan, as plain values, if it has one.
         realtime: what the real-time process was granted and refused; None on the lockstep clock.
         interventions: when an expert or a person drove, in order; None if none could take over.
@@ -50,6 +52,7 @@ class Episode:
     writer: Any
     commands: list[tuple[int, BrainCommand]] | None = None
     results: list[tuple[int, CommandResult]] = field(default_factory=list)
+    goal_frames: list[tuple[int, int]] = field(default_factory=list)
     plan: dict[str, Any] = field(default_factory=dict)
     realtime: list[dict[str, Any]] | None = None
     interventions: list[Intervention] | None = None

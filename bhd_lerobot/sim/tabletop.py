@@ -92,13 +92,14 @@ class Tabletop:
 
     # --- scenes ------------------------------------------------------------------------------------------------------
 
-    def place(self, scenes: Sequence[TableScene], ids: Ids = None, poses: NDArray[np.float64] | None = None) -> None:
+    def place(self, scenes: Sequence[TableScene], ids: Ids = None) -> None:
         """Start simulations anew: everything as the scene says, at rest, the servos holding the arm's posture.
+
+        A base stays where it stands: `World.reset` puts it there before.
 
         Args:
             scenes: one for each simulation named.
             ids: the simulations, all if None.
-            poses: of bases, see `World.reset`.
 
         Raises:
             SimulationError: the number of scenes does not fit, or a posture does not fit the arm.
@@ -112,7 +113,7 @@ class Tabletop:
                 raise SimulationError(
                     f"The posture of scene {scene.name!r} is {scene.posture}; it needs {len(self.arm.home)} numbers."
                 )
-        world.reset(ids, poses)
+        world.reset(ids, world.base_pose[ids] if self._is_mobile else None)
         for sim, scene in zip(ids, scenes, strict=True):
             self._surroundings(sim, scene)
             for number, thing in enumerate(scene.objects):

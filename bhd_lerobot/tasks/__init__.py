@@ -3,6 +3,7 @@
 __all__ = [
     "avoid",
     "faults",
+    "fetch",
     "free",
     "geodesic",
     "navigate",

@@ -24,6 +24,7 @@ class TaskConfig(Options, draccus.ChoiceRegistry, prefix="task."):
 
 _OWN: dict[str, Any] = {
     "avoid": "bhd_lerobot.tasks.avoid:AvoidTask",
+    "fetch": "bhd_lerobot.tasks.fetch:FetchTask",
     "free": "bhd_lerobot.tasks.free:FreeTask",
     "navigate": "bhd_lerobot.tasks.navigate:NavigateTask",
     "pick": "bhd_lerobot.tasks.pick:PickTask",
@@ -71,7 +72,7 @@ def outcomes_of(task: str | None, body: Body | None = None) -> tuple[str, ...]:
         task: the task's type; None if it is not known.
         body: the robot's hardware; None if it is not known.
     """
-    grasping = (Event.WRONG_OBJECT, Event.DROPPED) if body and body.drive else ()
+    grasping = (Event.WRONG_OBJECT, Event.DROPPED) if body and not body.arm else ()
     known = getattr(TASKS[task], "never", ()) if task and task in TASKS else ()  # of one that is not known, anything
     never = {event.cause for event in (*known, *grasping)}
     return tuple(name for name in OUTCOMES if name not in never)

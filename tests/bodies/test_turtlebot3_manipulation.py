@@ -124,7 +124,7 @@ def test_no_motion_of_the_base_tips_it_with_the_payload_at_full_reach() -> None:
         '</body><site name="tool"',
     )
     world = World(replace(BODY, mjcf=loaded), 1)
-    Tabletop(world).place([TableScene("stretched", (), STRETCHED)], None, np.zeros((1, 3)))
+    Tabletop(world).place([TableScene("stretched", (), STRETCHED)])
     world.step(BODY.physics_hz // 2)
     speeds, limits, worst = np.zeros(2), DRIVE.limits, 0.0
     for twist, bound in (

@@ -391,7 +391,8 @@ def test_poses_of_an_arm_on_a_base_are_those_in_the_frame_of_the_robot() -> None
     table, home = Tabletop(world), MOBILE.arm.home
     poses = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 0.7), (-0.5, 0.3, 3.0)])
     cup = TableObject("cup", "red", 0.02, 0.02, 0.06, 0.4, 0.9, yaw=0.3)
-    table.place([TableScene("one", (cup,), home)] * 3, None, poses)
+    world.reset(None, poses)
+    table.place([TableScene("one", (cup,), home)] * 3)
     np.testing.assert_allclose(world.base_pose, poses, atol=1e-12)
     for sim, (x, y, yaw) in enumerate(poses):
         base = Rotation.from_euler("z", yaw)
@@ -425,7 +426,7 @@ def test_touches_of_an_arm_on_a_base(posture: tuple[float, ...], shape: Shape | 
     world = World(MOBILE, 1)
     table = Tabletop(world)
     world.place([[shape] if shape else []])
-    table.place([TableScene("", (), posture)], None, np.zeros((1, 3)))
+    table.place([TableScene("", (), posture)])
     assert tuple(name for name in TOUCHES if world.sensor(name)[0, 0] > 0) == touched
     assert not table.arm_on_object.any()
 
@@ -439,12 +440,12 @@ def test_what_stands_in_the_arena_carries_an_object_until_the_gripper_touches_it
         stand_m = 0.15
 
     cup = TableObject("cup", "red", 0.02, 0.02, 0.06, 0.25, 0.0, mass=0.05)
-    table.place([Stand("", (cup,), MOBILE.arm.home)], None, np.zeros((1, 3)))
+    table.place([Stand("", (cup,), MOBILE.arm.home)])
     world.step(500)
     np.testing.assert_allclose(table.object_poses[0, 0, :3], (0.25, 0.0, 0.18), atol=5e-4)
     assert not table.finger_on_object.any()
     assert not table.is_touching_more
-    table.place([Stand("", (replace(cup, x=0.15, height=0.4),), MOBILE.arm.home)], None, np.zeros((1, 3)))
+    table.place([Stand("", (replace(cup, x=0.15, height=0.4),), MOBILE.arm.home)])
     world.qpos[0, world.joint_slice(MOBILE.arm.chain.joints)[0]] = (0.0, -0.2, 0.35, -0.1)
     world.forward()
     assert table.finger_on_object[0, 0]

@@ -1,3 +1,3 @@
 """Rules that drive an arm."""
 
-__all__ = ["goal_brain", "grasp", "pick", "reach", "servo", "skills"]
+__all__ = ["fetch", "goal_brain", "grasp", "pick", "reach", "servo", "skills"]

@@ -41,7 +41,8 @@ class GoalBrainConfig(BrainConfig):
 class GoalBrain(ConfiguredBrain, ABC):
     """A brain that gives each simulation one goal after the other.
 
-    A subclass returns the next goal in `decide`, which is called at the start and whenever a goal has ended.
+    A subclass returns the next goal in `decide`, which is called at the start, whenever a goal has ended, and in each
+    frame without one.
 
     Attributes:
         config: the parameters.
@@ -81,8 +82,10 @@ class GoalBrain(ConfiguredBrain, ABC):
         """Start an episode in one simulation."""
 
     @abstractmethod
-    def decide(self, sim: int, seen: Observation, result: CommandResult | None) -> BrainCommand | None:
-        """Return the next goal of one simulation; None for none any more.
+    def decide(
+        self, sim: int, seen: Observation, result: CommandResult | None
+    ) -> BrainCommand | NDArray[np.float64] | None:
+        """Return the next goal of one simulation, or the setpoint of a frame, shape (actions,); None for none any more.
 
         Args:
             sim: the simulation.
@@ -102,6 +105,7 @@ class GoalBrain(ConfiguredBrain, ABC):
     def act(self, observation: Observation) -> Goals:
         """Return the goals that come next."""
         commands: dict[int, list[BrainCommand]] = {}
+        setpoints: NDArray[np.float64] | None = None
         running = np.ones(len(self._pending), np.bool_) if observation.running is None else observation.running
         for sim in np.flatnonzero(running).tolist():
             if self._done[sim]:
@@ -113,11 +117,15 @@ class GoalBrain(ConfiguredBrain, ABC):
                     continue
                 result = ends[-1]
             command = self.decide(sim, observation, result)
+            if isinstance(command, np.ndarray):
+                setpoints = np.full((len(running), len(command)), np.nan) if setpoints is None else setpoints
+                setpoints[sim], self._pending[sim] = command, None
+                continue
             self._pending[sim] = None if command is None else command.task_id
             self._done[sim] = command is None
             if command is not None:
                 commands[sim] = [command]
-        return Goals(commands)
+        return Goals(commands, setpoints)
 
     def subtasks(self) -> Sequence[str]:
         """Return what each simulation's brain is doing, as text."""

@@ -88,6 +88,14 @@ def pointing_down(x: float, y: float, z: float, yaw: float) -> Pose:
     return Pose((x, y, z), (values[3], values[4], values[5], values[6]))
 
 
+def pointing_ahead(x: float, y: float, z: float, yaw: float) -> Pose:
+    """Return the pose of a level tool that points in the direction `yaw`, the line through its fingers level, too."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    matrix = np.array([[0.0, s, c, x], [0.0, -c, s, y], [1.0, 0.0, 0.0, z], [0.0, 0.0, 0.0, 1.0]])
+    values = pose_vectors(matrix).tolist()
+    return Pose((x, y, z), (values[3], values[4], values[5], values[6]))
+
+
 def plan_grasp(
     target: SeenObject,
     others: Sequence[SeenObject],

@@ -25,7 +25,7 @@ from bhd_lerobot.policies.manipulation.grasp import (
 from bhd_lerobot.policies.manipulation.skills import Plan, Skill, make_plan, scene_object
 
 SQUEEZE = 0.03  # [m] how far inside the object the fingers are sent: the gripper's force limit does the rest
-_MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
+MISSED = 0.010  # [m] an opening this much smaller than the object means that it is not between the fingers
 _LIFTED = 0.05  # [m] an object that was lifted by less slipped out
 _POSITION = [OBJECT_FIELDS.index(axis) for axis in "xyz"]
 
@@ -225,7 +225,7 @@ class PickBrain(GoalBrain):
 
     def _is_held(self, opening: float, grasp: Grasp) -> bool:
         """Return whether something is between the fingers, which were closed and are this far apart [m]."""
-        return opening >= grasp.width - _MISSED
+        return opening >= grasp.width - MISSED
 
     def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
         """Return whether the object came up with the gripper, whose fingers are this far apart [m]."""

@@ -20,19 +20,27 @@ _SIDE = 2 * _HALF + 1
 _AROUND = 12  # cells beyond all that was seen, in which ways are searched
 _UNIT = 0.001  # [m] of the stored lengths
 _FAR = 65535  # nothing known
-_BLOCKED_M = (0.135, 0.1)  # [m] from something seen, no way; the second where there is none else
-_ROOM_M = 0.3  # [m] from something seen, a way begins to be dearer
+# [m] beside the robot, from something seen:
+_BLOCKED_M = (0.046, 0.011)  # no way; the second where there is none else
+_ROOM_M = 0.211  # a way begins to be dearer
 _STEEP = 3.0  # what it costs in addition where it is blocked
 _END_CELLS = 3  # around the robot and the goal, that count as free
-_ALARM_M = 0.15  # [m] from the way, something seen newly is in it
+_ALARM_M = 0.061  # [m] beside the robot, something seen newly is in its way
 _OFF = 10.0  # what leaving the places with a way costs, per metre
 _STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
 
 class GoalMap:
-    """Maps of n robots."""
+    """Maps of n robots.
 
-    def __init__(self, n: int) -> None:
+    Args:
+        n: how many.
+        half_width: of a robot [m].
+    """
+
+    def __init__(self, n: int, half_width: float = 0.089) -> None:
+        self._blocked = [round(half_width + beside, 6) for beside in _BLOCKED_M]
+        self._room, self._alarm = round(half_width + _ROOM_M, 6), round(half_width + _ALARM_M, 6)
         self._seen = np.zeros((n, _SIDE, _SIDE), np.bool_)
         self._way = np.zeros((n, _SIDE, _SIDE), np.bool_)  # places that a new obstacle must not be in
         self._left = np.full((n, _SIDE, _SIDE), _FAR, np.uint16)
@@ -110,8 +118,8 @@ class GoalMap:
         ends: NDArray[np.bool_] = np.zeros(shape, np.bool_)
         for at_row, at_column in ((row, column), (_HALF, _HALF)):
             ends |= ((rows - at_row) ** 2 + (columns - at_column) ** 2 <= _END_CELLS**2) & ~seen
-        price = 1.0 + _STEEP * np.clip((_ROOM_M - room) / (_ROOM_M - _BLOCKED_M[1]), 0.0, 1.0)
-        for blocked in _BLOCKED_M:
+        price = 1.0 + _STEEP * np.clip((self._room - room) / (self._room - self._blocked[1]), 0.0, 1.0)
+        for blocked in self._blocked:
             graph = _graph(ends | (room > blocked), price)
             lengths, before = scipy.sparse.csgraph.dijkstra(
                 graph, directed=False, indices=goal, return_predecessors=True
@@ -130,7 +138,7 @@ class GoalMap:
         while cell >= 0:
             way[cell] = True
             cell = before[cell]
-        self._way[box] = scipy.ndimage.distance_transform_edt(~way.reshape(shape)) * CELL <= _ALARM_M
+        self._way[box] = scipy.ndimage.distance_transform_edt(~way.reshape(shape)) * CELL <= self._alarm
         return True
 
 

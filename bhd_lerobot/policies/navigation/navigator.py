@@ -82,6 +82,7 @@ class NavigatorBrain(DrivingBrain):
     """
 
     name = "navigator"
+    _half_widths: tuple[float, ...] = ()  # of the robot, once it is known
 
     def __init__(self, config: NavigatorConfig | None = None) -> None:
         self.config = config or NavigatorConfig()
@@ -109,13 +110,14 @@ class NavigatorBrain(DrivingBrain):
         """Find the scan, the twist and the goal, and prepare the look-up table for this number of beams."""
         super().bind(robot)
         self._goal_columns = find_columns(robot.environment_names, GOAL, self.name, "environment")
+        self._half_widths = (max(half for _, _, half in self._paths.footprint.outline),)
         self._replan_frames = max(1, round(min(self.config.replan_s * robot.fps, 2**29)))
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Forget what was seen; the seeds are not used, the rule draws nothing."""
         if n != getattr(self, "_n", -1):
             self._n = n
-            self._map = GoalMap(n)
+            self._map = GoalMap(n, *self._half_widths)
             self._scan: Array = np.zeros((n, 0))  # the last one
             self._heading: Array = np.zeros(n)  # chosen before, in the goal's frame [rad]
             self._arrived: NDArray[np.bool_] = np.zeros(n, np.bool_)

@@ -190,22 +190,24 @@ class Host(ABC):
                 pass
             case Chunk(actions):
                 self._send_chunk(actions, start_ns, receipt)
-            case Goals(commands):
+            case Goals(commands, setpoints):
+                if setpoints is not None:
+                    streamed = np.isin(np.arange(self.n), command.streamed)
+                    self._send_setpoint(np.nan_to_num(setpoints), receipt, streamed)
                 for sim, goals in commands.items():
                     refusals = [refusal for goal in goals if (refusal := self.bridge.submit(goal, sim)) is not None]
                     if refusals:
                         receipt.results[sim] = refusals
             case _:
-                self._send_setpoint(command, receipt)
+                self._send_setpoint(command, receipt, self.running)
         return receipt
 
-    def _send_setpoint(self, action: NDArray[np.float64], receipt: Acceptance) -> None:
-        mask = self.running
+    def _send_setpoint(self, action: NDArray[np.float64], receipt: Acceptance, mask: NDArray[np.bool_]) -> None:
+        mask = mask & self.running
         if not mask.any():
             return
         setpoints, refused = self.to_setpoints(action, mask, None)
         if refused:
-            mask = mask.copy()
             mask[list(refused)] = False
         receipt.sent = self.bridge.send(setpoints, mask)
         receipt.refuse(refused)
@@ -259,8 +261,11 @@ class Host(ABC):
     def _requested(self, command: Command, applied: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the action that was requested for a frame, shape (n, actions)."""
         match command:
-            case Goals():
+            case Goals(_, None):
                 return applied
+            case Goals(_, setpoints):
+                assert setpoints is not None
+                return np.where(np.isfinite(setpoints), setpoints, applied)
             case None | Chunk():
                 return self.to_action(self.cerebellum.requested)  # of a chunk its row for this frame, or its last
             case _:

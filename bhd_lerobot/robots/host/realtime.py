@@ -237,7 +237,7 @@ class LiveHost(Host):
             self,
             before,
             after,
-            requested="command" if isinstance(command, Goals) else "requested",
+            requested="command" if isinstance(command, Goals) and command.setpoints is None else "requested",
             truth=partial(self.__truth_at, end, end["touches"] > before.state["touches"]),
             origin_ns=self.__origin,
         )
