@@ -497,6 +497,7 @@ class Handling:
         palm: from the tool centre point up to where an object would touch the palm [m].
         lowest: the tool centre point above the table when the finger tips are just above it [m].
         travel: height of the tool above the table on free motions: the finger tips stay above every object [m].
+        highest: what is taken with the tool centre point higher than this above the table did not stand on it [m].
         lift: height by which it can lift what it has grasped anywhere on its table [m].
         neutral: direction from the right to the left finger, beside that from the base to the tool, when the wrist is
             turned as at home [rad].
@@ -510,6 +511,7 @@ class Handling:
     palm: float = 0.055
     lowest: float = 0.024
     travel: float = 0.22
+    highest: float = 0.2
     lift: float = 0.15
     neutral: float = 0.0
     fixed: float | None = None

@@ -202,7 +202,7 @@ def turtlebot3_manipulation(
             workspace=Workspace(
                 tool=((0.10, -0.15, 0.05), (0.26, 0.15, 0.35)),
                 around_home=(0.8, 1.0, 0.9, 1.2),
-                table=((0.13, -0.06), (0.26, 0.06)),
+                table=((0.20, -0.06), (0.25, 0.06)),
                 reach=0.30,
                 handling=Handling(
                     scale=0.5,
@@ -210,6 +210,7 @@ def turtlebot3_manipulation(
                     palm=0.030,
                     lowest=0.047,
                     travel=0.15,
+                    highest=0.12,
                     lift=0.06,
                     neutral=-math.pi / 2,
                     hand_over=(0.25, 0.0, 0.30),

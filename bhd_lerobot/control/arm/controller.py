@@ -266,7 +266,8 @@ class ArmController(Controller):
 
     def _hold(self, sim: int) -> None:
         """Note what a gripper holds now."""
-        held = held_capsule(self.arm.chain, self._forward, self.states[sim], self.arms[sim])
+        highest = self.arm.workspace.handling.highest
+        held = held_capsule(self.arm.chain, self._forward, self.states[sim], self.arms[sim], highest)
         self.goals.hold(sim, held)
         arm = self.arms[sim]
         arm["geometry"] = 0 if held is None else 1 + sim

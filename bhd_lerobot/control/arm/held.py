@@ -2,13 +2,12 @@
 
 from typing import Any
 
-from bhd_lerobot.bodies.body import HELD, ArmChain, Capsule
+from bhd_lerobot.bodies.body import HELD, ArmChain, Capsule, Handling
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.motion.supervision import GRIPPER_STILL
 
 _INSIDE = 0.005  # [m] a gripper that stalls so far from where it is commanded to holds something
-_HIGHEST = 0.2  # [m] what is taken with the tool higher than this above the table did not stand on it
 _SLACK = 0.0002  # [m] by which it may come nearer to the table than when it was taken: it can be put back
 
 
@@ -30,17 +29,20 @@ def follow_gripper(state: Any, arm: Any, limits: Any) -> bool:
     return (arm.held_ticks >= limits.stall_ticks) != holds
 
 
-def held_capsule(chain: ArmChain, forward: ForwardKinematics, state: Any, arm: Any) -> Capsule | None:
+def held_capsule(
+    chain: ArmChain, forward: ForwardKinematics, state: Any, arm: Any, highest: float = Handling.highest
+) -> Capsule | None:
     """Return what a gripper holds; None if it holds nothing, or what it holds did not stand on the table.
 
     It is taken to reach as far down as the table was when the fingers stopped, and to be as thick as they were apart.
+    `highest`: see `Handling`.
     """
     if not arm["held_ticks"]:
         return None
     dof = forward.dof
     tool = forward.tool(arm["held_at"][:dof])
     below = float(tool[2, 3]) - chain.min_distance - _SLACK
-    if not 0.0 < below < _HIGHEST:
+    if not 0.0 < below < highest:
         return None
     radius = min(float(state["position"][dof]) / 2, 0.9 * below)  # a capsule with a direction
     at = chain.tool.matrix()
