@@ -53,7 +53,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "policies.mlp",
     ),
     "policies.navigation": ("bodies", "policies"),
-    "policies.manipulation": (*_TASKS, "policies"),
+    "policies.manipulation": (*_TASKS, "policies", "policies.navigation"),
     "policies.perception": ("bodies", "policies", "policies.learned", "policies.manipulation"),
     "policies.pixels": ("bodies", "policies", "policies.learned", "policies.mlp", "policies.perception"),
     "policies.language": (*_TASKS, "policies", "policies.manipulation", "policies.perception"),

@@ -87,7 +87,7 @@ class FetchBrain(GoalBrain):
         self._problems: dict[int, str] = {}
         self._rows: dict[int, NDArray[np.float64]] = {}  # the setpoint that holds the arm while the base drives
         self._to: NDArray[np.int64] = np.zeros(0, np.int64)  # where the navigator drives; -1 for nowhere
-        self._twists = np.zeros((0, 2))
+        self._twists: NDArray[np.float64] = np.zeros((0, 2))
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find what is told, and how far and how high the hand has to be for what it takes."""
