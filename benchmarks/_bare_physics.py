@@ -13,8 +13,8 @@ import numpy as np
 
 from bhd_lerobot.control.kernels import never_compiled
 from bhd_lerobot.envs.vector import BhdVectorEnv
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 
 STEP, SCAN, PLACE, RESET = range(4)
 Entry = tuple[Any, ...]
@@ -62,7 +62,7 @@ def again(log: list[Entry], state: np.ndarray) -> float:
         AssertionError: the world did not end where it did.
     """
     n = len(state)
-    simulation = BaseSimulation(TurtleBot3Config(), n)
+    simulation = Simulation(TurtleBot3Config(), n)
     world, lidar = simulation.world, simulation.lidar
     rngs = [np.random.default_rng(i) for i in range(n)]
     took = 0.0

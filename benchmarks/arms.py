@@ -14,8 +14,8 @@ from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.manipulation.pick import PickBrain
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Task
@@ -45,7 +45,7 @@ def main() -> int:
         if args.case not in name:
             continue
         started = time.perf_counter()
-        episodes = run(ArmSimulation(UR5Config(), n), task, brain, seeds)
+        episodes = run(Simulation(UR5Config(), n), task, brain, seeds)
         took = time.perf_counter() - started
         add_success(report, name, [episode.outcome for episode in episodes], goal)
         seconds = sum(episode.frames for episode in episodes) / _FPS

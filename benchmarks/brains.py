@@ -17,8 +17,8 @@ from bhd_lerobot.evaluation.results import SCORE_RANGE
 from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 
 GOAL_RATIO = 1.5
@@ -33,7 +33,7 @@ def main() -> int:
     config, n = TurtleBot3Config(), min(SIDE_BY_SIDE, len(seeds))
     scores, failures = [], []
     for brain in (AvoidanceBrain(), GapFollowerBrain()):
-        simulation = BaseSimulation(config, n)
+        simulation = Simulation(config, n)
         task = AvoidTask(AvoidConfig(duration_s=args.episode_s), n, config.fps)
         outcomes = [one.outcome for one in run(simulation, task, brain, seeds)]
         add_success(report, brain.name, outcomes)

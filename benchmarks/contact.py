@@ -21,8 +21,8 @@ from benchmarks._turns import status
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 
 LIGHT_N, WITHIN_S = 20.0, 0.5
 # Joint speeds as shares of the speed; the gripper's last.
@@ -65,7 +65,7 @@ def run(
 ) -> Outcome:
     """Move an arm into something by setpoints of a steady speed [rad/s], and wait."""
     force = 150.0 if way != WAYS[2] else float("inf")
-    arm = ArmSimulation(UR5Config(max_force=force), 1, threads=1, fixtures=fixtures)
+    arm = Simulation(UR5Config(max_force=force), 1, threads=1, fixtures=fixtures)
     arm.reset(np.zeros(1, np.intp), [TableScene("empty", (), arm.body.arm.home)], [0])
     if way != WAYS[0]:
         arm.cerebellum.controller.arm_limits["keeps_clear"] = False

@@ -14,8 +14,8 @@ from benchmarks._report import Report, parse_options
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 
 PATH_GOAL_M, SETTLE_GOAL_S = 0.001, 0.2
 SPEED = 0.25  # [m/s]
@@ -27,7 +27,7 @@ def main() -> int:
     """Measure both, print the table, return 0 if the goals are met."""
     args = parse_options(__doc__, motions=100, seed=0)
     rng = np.random.default_rng(args.seed)
-    simulation = ArmSimulation(UR5Config())
+    simulation = Simulation(UR5Config())
     simulation.reset(np.zeros(1, np.intp), [TableScene("empty", (), simulation.body.arm.home)], [0])
     report = Report(f"{args.motions} motions each, seed {args.seed}")
     for what, found, unit, goal in (
@@ -39,7 +39,7 @@ def main() -> int:
     return report.end(args.json)
 
 
-def follow(simulation: ArmSimulation, goal: BrainCommand) -> tuple[ResultCode, NDArray, NDArray]:
+def follow(simulation: Simulation, goal: BrainCommand) -> tuple[ResultCode, NDArray, NDArray]:
     """Follow a goal; return how it ended, and the joints as measured and as commanded at every tick.
 
     Measured are positions and speeds, shape (ticks, 12); commanded are positions, shape (ticks, 6).
@@ -56,13 +56,13 @@ def follow(simulation: ArmSimulation, goal: BrainCommand) -> tuple[ResultCode, N
             return result.code, np.array(measured), np.array(commanded)
 
 
-def reading(simulation: ArmSimulation) -> NDArray[np.float64]:
+def reading(simulation: Simulation) -> NDArray[np.float64]:
     """Return the positions and speeds of the six joints now."""
     state = simulation.bridge.state()
     return np.concatenate([state.joint_positions[0, :6], state.joint_velocities[0, :6]])
 
 
-def lines(simulation: ArmSimulation, rng: np.random.Generator, motions: int) -> NDArray[np.float64]:
+def lines(simulation: Simulation, rng: np.random.Generator, motions: int) -> NDArray[np.float64]:
     """Return the largest distance from the line of each motion [m]."""
     kinematics = simulation.kinematics
     worst: list[float] = []
@@ -95,7 +95,7 @@ def lines(simulation: ArmSimulation, rng: np.random.Generator, motions: int) -> 
     return np.array(worst)
 
 
-def settle(simulation: ArmSimulation, rng: np.random.Generator, motions: int) -> NDArray[np.float64]:
+def settle(simulation: Simulation, rng: np.random.Generator, motions: int) -> NDArray[np.float64]:
     """Return the settling time after each joint goal [s]."""
     times: list[float] = []
     home = np.array(simulation.body.arm.home[:6])

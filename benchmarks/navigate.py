@@ -13,8 +13,8 @@ from benchmarks._episodes import add_success, parse_episodes
 from benchmarks._report import Report, mean
 from bhd_lerobot.evaluation import statistics
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
@@ -52,7 +52,7 @@ def main() -> int:
 def drive(config: NavigateConfig, seeds: list[int], n: int) -> tuple[list[Outcome], list[float]]:
     """Run the brain in the scenes of these seeds, n side by side; return the outcomes, and the times of its calls."""
     robot = TurtleBot3Config(collision_monitor=True)
-    loop = EpisodeLoop(BaseSimulation(robot, n), NavigateTask(config, n, robot.fps), NavigatorBrain())
+    loop = EpisodeLoop(Simulation(robot, n), NavigateTask(config, n, robot.fps), NavigatorBrain())
     episodes = loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])
     return [episode.outcome for episode in episodes], loop.act_times
 

@@ -30,10 +30,9 @@ from bhd_lerobot.options.parse import parse
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
@@ -60,7 +59,7 @@ def real_time(folder: Path, robot: str, n: int, episodes: int, *options: str) ->
 
 def bare_step(robot: str, n: int, simulated_s: float = 20.0) -> float:
     """Return simulated seconds in a second of the physics steps, and of the TurtleBot3 the scans, alone."""
-    simulation: Any = BaseSimulation(TurtleBot3Config(), n) if robot == "turtlebot3" else ArmSimulation(UR5Config(), n)
+    simulation: Any = Simulation(TurtleBot3Config(), n) if robot == "turtlebot3" else Simulation(UR5Config(), n)
     fps = simulation.rates.fps
     task = AvoidTask(AvoidConfig(), n, fps) if robot == "turtlebot3" else PickTask(PickConfig(), n, fps)
     simulation.reset(np.arange(n), [task.sample(2 * i) for i in range(n)], range(n))
@@ -76,9 +75,9 @@ def bare_step(robot: str, n: int, simulated_s: float = 20.0) -> float:
     return n * simulated_s / (time.perf_counter() - started)
 
 
-def make_scene() -> BaseSimulation:
+def make_scene() -> Simulation:
     """Return a simulation in a random arena."""
-    simulation = BaseSimulation(TurtleBot3Config())
+    simulation = Simulation(TurtleBot3Config())
     simulation.reset(np.zeros(1, int), [AvoidTask(AvoidConfig(), 1, 10).sample(0)], [0])
     return simulation
 

@@ -30,10 +30,9 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 
 Array = NDArray[np.float64]
@@ -118,14 +117,14 @@ def make(space: str, n: int) -> Any:
     """Return n simulated robots at the start of an episode."""
     if space in ("wheels", MONITORED):
         monitored = space == MONITORED
-        base = BaseSimulation(TurtleBot3Config(beams=360 if monitored else 36, collision_monitor=monitored), n)
+        base = Simulation(TurtleBot3Config(beams=360 if monitored else 36, collision_monitor=monitored), n)
         task = AvoidTask(AvoidConfig(), n, base.rates.fps)
         base.reset(np.arange(n), [task.sample(seed) for seed in range(n)], range(n))
         return base
     options: dict[str, Any] = {"joints": {}, "tool": {"action_space": "tool"}}.get(
         space, {"action_space": "tool", "control": "impedance"}
     )
-    arm = ArmSimulation(UR5Config(**options), n)
+    arm = Simulation(UR5Config(**options), n)
     arm.reset(np.arange(n), [TableScene("empty", (), arm.body.arm.home)] * n, range(n))
     return arm
 

@@ -77,13 +77,10 @@ class _Blanked(BlankedBrain):
         return robot_of_brain(config.brain)
 
 
-_SIMULATIONS: dict[str, Any] = {
-    "arm": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
-    "so101": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
-    "turtlebot3": "bhd_lerobot.robots.base_simulation:BaseSimulation",
-    "ur5": "bhd_lerobot.robots.arm_simulation:ArmSimulation",
-}
-ROBOTS: Registry[Any] = Registry("robot", _SIMULATIONS, RobotConfig)
+_SIMULATION = "bhd_lerobot.robots.host.simulation:Simulation"
+ROBOTS: Registry[Any] = Registry(
+    "robot", dict.fromkeys(("arm", "so101", "turtlebot3", "ur5"), _SIMULATION), RobotConfig
+)
 """The classes of the robots' simulations, by type; those of this package import MuJoCo."""
 
 _CLASSES: tuple[Any, ...] = (

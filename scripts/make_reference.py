@@ -30,9 +30,9 @@ from bhd_lerobot.options.declared import declaration_of
 from bhd_lerobot.options.help import meanings_of, summary_of
 from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.base_host import observation_names
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.parts.names import drive_observation_names
 from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.ros2.serve.bridge import BridgeConfig
@@ -298,7 +298,7 @@ def _columns() -> str:
     image = (config.camera_height, config.camera_width, 3)
     # The state of a free body (7 positions, 6 velocities) and of two wheels.
     base = keys.dataset_features(
-        observation_names(config),
+        drive_observation_names(config),
         ("x.vel", "theta.vel"),
         {"front": image},
         {keys.PHYSICS_STATE: [str(i) for i in range(17)]},

@@ -31,13 +31,14 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "realtime": ("bodies.body", "control.*"),
     "tasks": _TASKS,
     "robots.host": (
-        *("bodies.body", "bodies.scenes", "sim", "control.*", "realtime", "datasets.format"),
-        "ros2.live.network",
+        *("bodies.body", "bodies.scenes", "bodies.tabletop", "bodies.truth", "robots.parts"),
+        *("sim", "control.*", "realtime", "datasets.format", "ros2.live.network"),
     ),
+    "robots.parts": ("bodies.body", "bodies.tabletop", "sim", "control.*"),
     "robots.viewer": ("bodies.scenes", "realtime", "robots.host", "sim.window"),
     "robots.external": ("realtime", "options", "bodies.body", "control", "datasets.format", "robots.host"),
     "robots.device": ("options", "bodies.body", "control", "control.geometry", "robots.external"),
-    "robots": ("realtime", "tasks", "bodies", "sim.*", "control.*", "robots.host", "ros2.live.network"),
+    "robots": ("realtime", "tasks", "bodies", "sim.*", "control.*", "robots.host", "robots.parts", "ros2.live.network"),
     "registry": ("options", "bodies", "tasks", "robots.*", "policies.*", "ros2.robots.config_robot"),
     "envs": ("registry", "tasks", "bodies", "sim", "robots.*", "options"),
     "policies": (*_TASKS, "datasets.format.features"),
@@ -111,7 +112,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "teleoperators": (
         "realtime",
         *("bodies", "control", "control.geometry", "control.arm"),
-        *("policies.*", "robots", "registry"),
+        *("policies.*", "robots", "robots.parts", "registry"),
     ),
     "plugin": ("versions", "envs", "policies.*", "registry", "ros2.robots.config_robot", "teleoperators"),
     "training": (

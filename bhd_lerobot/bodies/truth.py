@@ -1,6 +1,7 @@
 """What a simulator, or a robot's own sensors, know of bases and arms: what tasks judge by."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,3 +41,15 @@ class ArmTruth:
     arm_on_object: NDArray[np.bool_]
     self_contact: NDArray[np.bool_]
     fingers_on_object: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MobileArmTruth(BaseTruth, ArmTruth):
+    """What the simulator knows about arms on bases, at the end of a frame; poses are in the base frame of each."""
+
+
+def truth_of(fields: dict[str, Any]) -> BaseTruth | ArmTruth | MobileArmTruth:
+    """Return what is known of robots with a drive, an arm or both, by its fields."""
+    if "tool_pose" not in fields:
+        return BaseTruth(**fields)
+    return MobileArmTruth(**fields) if "touched" in fields else ArmTruth(**fields)

@@ -42,7 +42,7 @@ class PlantReading:
             plant whose readings are never old, such as a simulation in lockstep.
         safety: a `SafetyStatus` of each robot, shape (n,); all but `NORMAL` is a fault or an emergency stop.
         sensors: the newest further values, shape (n, sensors): what they are, and in which order, says the host; see
-            `bhd_lerobot.robots.base_host.BaseHost`.
+            `bhd_lerobot.robots.parts.drive.DrivePart`.
         sensors_ns: when the oldest of these was measured, as `stamp_ns` [ns], shape (n,).
     """
 

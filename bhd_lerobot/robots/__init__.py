@@ -2,11 +2,7 @@
 
 __all__ = [
     "arm",
-    "arm_host",
-    "arm_simulation",
     "base",
-    "base_host",
-    "base_simulation",
     "config",
     "config_arm",
     "config_turtlebot3",
@@ -15,7 +11,7 @@ __all__ = [
     "device",
     "external",
     "host",
-    "latency",
+    "parts",
     "robot",
     "turtlebot3",
     "ur5",

@@ -1,13 +1,11 @@
 """A simulated arm as a LeRobot robot."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.robots.arm_host import observation_names, tool_names
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_arm import ArmConfig, FileArmConfig, SO101Config
 from bhd_lerobot.robots.robot import BhdRobot
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
@@ -26,8 +24,6 @@ class SimulatedArm(BhdRobot):
         config: the configuration.
     """
 
-    simulation_class: ClassVar[type[ArmSimulation]] = ArmSimulation
-
     def __init__(self, config: ArmConfig) -> None:
         super().__init__(config)
         self._task: Any = None
@@ -39,7 +35,7 @@ class SimulatedArm(BhdRobot):
 
     def make_scene(self) -> TableScene:
         """Return the configured scene."""
-        scene = self.simulation_class.start_scene(self.config)
+        scene: TableScene = super().make_scene()
         if self._task is not None:
             self._task.begin(np.zeros(1, np.intp), [scene])
         self._scene = scene
@@ -56,16 +52,6 @@ class SimulatedArm(BhdRobot):
     def instruction(self) -> str:
         """What a person would ask for in the scene."""
         return "" if self._task is None or self._scene is None else self._task.instruction(self._scene)
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Names of the observation's floats, in order."""
-        return observation_names(self.body, tool_pose=self.config.tool_pose)
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Names of the action's floats, in order."""
-        return tool_names(self.body) if self.config.action_space == "tool" else super().action_names
 
 
 class FileArm(SimulatedArm):

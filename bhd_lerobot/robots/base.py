@@ -1,10 +1,5 @@
 """A simulated base on two wheels as a LeRobot robot."""
 
-from typing import ClassVar
-
-from bhd_lerobot.bodies.arenas import Arena
-from bhd_lerobot.robots.base_host import observation_names
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.robot import BhdRobot
 
 
@@ -18,14 +13,3 @@ class SimulatedBase(BhdRobot):
     Args:
         config: the configuration.
     """
-
-    simulation_class: ClassVar[type[BaseSimulation]] = BaseSimulation
-
-    def make_scene(self) -> Arena:
-        """Return the configured arena."""
-        return self.simulation_class.start_scene(self.config)
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """Names of the observation's floats, in order."""
-        return observation_names(self.config)

@@ -7,8 +7,8 @@ from typing import Annotated, Any, ClassVar
 
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.bodies.arenas import ARENAS
-from bhd_lerobot.bodies.body import Body, Rates
+from bhd_lerobot.bodies.arenas import ARENAS, Arena, make_arena
+from bhd_lerobot.bodies.body import Body, Drive, Rates
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Whole, check_options
 from bhd_lerobot.robots.host.config import CLOCKS, RealtimeConfig
@@ -156,6 +156,10 @@ class BhdRobotConfig(RobotConfig):
     def body(self) -> Any:
         """Return the hardware that this configuration describes."""
 
+    @abstractmethod
+    def start_scene(self) -> Any:
+        """Return the scene that a robot is in that is used by itself."""
+
 
 @dataclass(kw_only=True)
 class MobileBaseConfig(BhdRobotConfig):
@@ -199,3 +203,7 @@ class MobileBaseConfig(BhdRobotConfig):
     @abstractmethod
     def body(self) -> Body:
         """Return the hardware that this configuration describes."""
+
+    def start_scene(self) -> Arena:
+        """Return the configured arena."""
+        return make_arena(self.arena, self.seed, robot_radius=self.body().need(Drive).radius)

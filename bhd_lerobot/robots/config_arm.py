@@ -11,6 +11,7 @@ from lerobot.robots.config import RobotConfig
 from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
 from bhd_lerobot.bodies.body import OBSTACLE, Arm, Body, Capsule
 from bhd_lerobot.bodies.so101 import JAW_READINGS, SO101
+from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
 from bhd_lerobot.robots.config import BhdRobotConfig
@@ -84,6 +85,18 @@ class ArmConfig(BhdRobotConfig):
     @abstractmethod
     def body(self) -> Body:
         """Return the hardware that this configuration describes."""
+
+    def start_scene(self) -> TableScene:
+        """Return the configured scene: empty, or one of a task."""
+        from bhd_lerobot.tasks.pick import PickConfig, PickTask
+        from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+
+        body = self.body()
+        if self.scene == "reach":
+            return ReachTask(ReachConfig(), 1, self.fps, body).sample(self.seed)
+        if self.scene == "pick":
+            return PickTask(PickConfig(), 1, self.fps, body).sample(self.seed)
+        return TableScene("empty", (), body.need(Arm).home)
 
 
 @dataclass

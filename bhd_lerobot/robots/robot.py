@@ -2,7 +2,6 @@
 
 import math
 import weakref
-from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar
@@ -20,6 +19,7 @@ from bhd_lerobot.realtime.estop import POLL_S, EstopInputs, Source, check_source
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.realtime import make_live
 from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.parts.names import action_names, observation_names
 
 # Robots that are connected in this process. LeRobot's recording loop hands no observation to a teleoperator: a brain
 # finds its robot here. Weak, so that a forgotten robot is freed.
@@ -42,7 +42,7 @@ class BhdRobot(Robot):
     once, and a robot that gets no command for too long decelerates and holds.
     """
 
-    simulation_class: ClassVar[type[Simulation]]
+    simulation_class: ClassVar[type[Simulation]] = Simulation
     config: Any
 
     def __init__(self, config: Any) -> None:
@@ -65,14 +65,14 @@ class BhdRobot(Robot):
         made: Simulation = simulation(self.config)
         return made
 
-    @abstractmethod
     def make_scene(self) -> Any:
         """Return where the robot is when it is used by itself."""
+        return self.config.start_scene()
 
     @property
-    @abstractmethod
     def observation_names(self) -> tuple[str, ...]:
         """Names of the observation's floats, in order."""
+        return observation_names(self.config, self.body)
 
     @cached_property
     def body(self) -> Body:
@@ -83,7 +83,7 @@ class BhdRobot(Robot):
     @property
     def action_names(self) -> tuple[str, ...]:
         """Names of the action's floats, in order."""
-        return self.body.limits.names
+        return action_names(self.config, self.body)
 
     @property
     def camera_shapes(self) -> dict[str, tuple[int, int, int]]:

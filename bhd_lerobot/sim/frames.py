@@ -323,7 +323,7 @@ def note_touches(touches: NDArray[np.bool_], sim: int, sensordata: Numbers, layo
 
 
 class Late(Protocol):
-    """Servos that get their commands late, see `bhd_lerobot.robots.latency.LatePlant`."""
+    """Servos that get their commands late, see `bhd_lerobot.robots.parts.latency.LatePlant`."""
 
     ring: Numbers
     latency: Counts

@@ -12,7 +12,7 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.arm_host import TOOL_NAMES
+from bhd_lerobot.robots.parts.names import TOOL_NAMES
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control.collision_monitor import MARGIN, new_monitors
 from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.messages import Limit, Mode
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from tests.control import support
 from tests.control.test_wire import base_rig
 
@@ -49,7 +49,7 @@ def drive(
 
     It ends once `enough` robots have touched something.
     """
-    simulation = BaseSimulation(TurtleBot3Config(collision_monitor=monitor), N)
+    simulation = Simulation(TurtleBot3Config(collision_monitor=monitor), N)
     simulation.reset(np.arange(N), [make_arena(arena, seed) for seed in range(N)], list(range(N)))
     rng, action = np.random.default_rng(3), np.zeros((N, 2))
     touched, limits, applied = np.zeros(N, np.bool_), np.zeros(N, np.int64), []

@@ -9,8 +9,8 @@ from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, Tab
 from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import ENVIRONMENT
@@ -94,6 +94,6 @@ def episodes(
     brain, task: Callable[..., Task], config: TaskConfig, seeds: Sequence[int], *, n: int = 0, simulation=None, **robot
 ) -> list[Episode]:
     """Return the episodes of a brain in the simulator, by their seeds; all side by side unless `n` is given."""
-    simulation = simulation or ArmSimulation(UR5Config(**robot), n or len(seeds), threads=1)
+    simulation = simulation or Simulation(UR5Config(**robot), n or len(seeds), threads=1)
     judge = task(config, simulation.n, simulation.config.fps)
     return list(EpisodeLoop(simulation, judge, brain).run([EpisodeSpec(k, seed) for k, seed in enumerate(seeds)]))

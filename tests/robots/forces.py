@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
+from bhd_lerobot.robots.host.simulation import Simulation
 
 Array = NDArray[np.float64]
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 class Contacts:
     """The contacts of the first arm of a simulation, by its physics."""
 
-    def __init__(self, arm: ArmSimulation) -> None:
+    def __init__(self, arm: Simulation) -> None:
         self._world = arm.world
         self._model = arm.world.copy_model(0)
         self._data = mujoco.MjData(self._model)
@@ -46,7 +46,7 @@ class Wall:
     """
 
     def __init__(
-        self, simulation: ArmSimulation, direction: Array, speed: float, seconds: float, stiffness: float = 2e4
+        self, simulation: Simulation, direction: Array, speed: float, seconds: float, stiffness: float = 2e4
     ) -> None:
         world, self._hz = simulation.world, simulation.rates.control_hz
         self._direction = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)

@@ -13,8 +13,8 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
 from bhd_lerobot.errors import CommandRefusedError, ConfigError
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.ur5 import UR5
 from tests.robots.forces import Contacts, Wall
 
@@ -31,7 +31,7 @@ class Pusher:
     def __init__(
         self, *, clearance: bool = True, measures: bool = False, fixtures: tuple[Shape, ...] = (), **config: Any
     ) -> None:
-        self.arm = arm = ArmSimulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
+        self.arm = arm = Simulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
         arm.reset(FIRST, [TableScene("empty", (), arm.body.arm.home)], [0])
         self.controller: Any = arm.cerebellum.controller
         if not clearance:
@@ -238,7 +238,7 @@ def test_setpoints_and_goals_keep_away_from_obstacles_that_are_declared() -> Non
 UP, DOWN, ASIDE, ASKEW = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.3, 1.0, 0.0), (-0.5, 0.4, 0.6)
 
 
-def settled(arm: ArmSimulation, wall: Wall, seconds: float) -> tuple[float, float]:
+def settled(arm: Simulation, wall: Wall, seconds: float) -> tuple[float, float]:
     """Let time go by; return the largest force of the wall in the last half of it, and a joint's largest speed."""
     forces, fastest = [], 0.0
     for frame in range(round(seconds * 25)):
@@ -263,7 +263,7 @@ def settled(arm: ArmSimulation, wall: Wall, seconds: float) -> tuple[float, floa
 def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
     cause: str, direction: tuple[float, ...], speed: float, seconds: float, stiffness: float, latency_s: float
 ) -> None:
-    arm = ArmSimulation(UR5Config(), 1, threads=1)
+    arm = Simulation(UR5Config(), 1, threads=1)
     scene = TableScene("empty", (), arm.body.arm.home, variation=Variation(latency_s=latency_s))  # type: ignore[union-attr]
     arm.reset(FIRST, [scene], [0])
     if cause == "fault":
@@ -285,7 +285,7 @@ def test_a_stopped_arm_gives_way_for_as_long_as_it_is_pushed(  # noqa: PLR0917
 
 def test_a_hard_push_that_stays_as_it_is_while_it_is_followed_is_no_load() -> None:
     """In a direction that the joints hardly feel; taken for a load, it became twice as hard."""
-    arm = ArmSimulation(UR5Config(), 1, threads=1)
+    arm = Simulation(UR5Config(), 1, threads=1)
     posture = (0.6186, -1.6973, -0.6542, -0.4595, 0.942, 2.2784, 0.085)
     arm.reset(FIRST, [TableScene("empty", (), posture)], [0])
     arm.cerebellum.estop.press()
@@ -299,7 +299,7 @@ def test_a_hard_push_that_stays_as_it_is_while_it_is_followed_is_no_load() -> No
 
 def test_an_arm_in_hold_is_watched_after_reset_and_activate_before_any_command() -> None:
     for direction in (UP, DOWN, ASIDE, ASKEW):
-        arm = ArmSimulation(UR5Config(), 1, threads=1)
+        arm = Simulation(UR5Config(), 1, threads=1)
         arm.reset(FIRST, [TableScene("empty", (), arm.body.arm.home)], [0])  # type: ignore[union-attr]
         arm.cerebellum.estop.press()
         for _ in range(5):
@@ -349,7 +349,7 @@ def test_the_limit_of_force_holds_in_random_postures_and_directions() -> None:
     postures = np.array(body.arm.home)[:6] + rng.uniform(-1.2, 1.2, (200, 6))  # type: ignore[union-attr]
     far = np.min(ArmKinematics(body.arm.chain, body.limits).collision.distances(postures), axis=0) > 0.02  # type: ignore[union-attr]
     scenes = [TableScene("empty", (), (*posture, 0.04)) for posture in postures[far][:32]]
-    arm = ArmSimulation(UR5Config(), len(scenes))
+    arm = Simulation(UR5Config(), len(scenes))
     arm.reset(np.arange(len(scenes)), scenes, range(len(scenes)))
     directions = rng.normal(size=(len(scenes), 3))
     wall, most = Wall(arm, directions, 0.02, 10.0), np.zeros(len(scenes))
@@ -377,7 +377,7 @@ def test_the_stop_of_an_arm_that_drives_fast_into_a_wall_needs_no_guard() -> Non
     n, speed = len(BOUNCES), 0.25
     watchdog = np.zeros(n, np.int64)
     for start in np.linspace(-0.004, 0.004, 5):  # another phase of the contact each
-        arm = ArmSimulation(UR5Config(), n)
+        arm = Simulation(UR5Config(), n)
         scenes = [TableScene("empty", (), (*posture, 0.085)) for posture in postures + start]
         arm.reset(np.arange(n), scenes, range(n))
         Wall(arm, directions, 0.0, 1e9)

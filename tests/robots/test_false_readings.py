@@ -11,8 +11,8 @@ from benchmarks import wire
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.messages import Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from tests.robots.forces import Wall
 
 Array = NDArray[np.float64]
@@ -29,7 +29,7 @@ class Lied:
     def __init__(self, joints: Any, lie: Lie) -> None:
         self.joints = np.asarray(joints)
         self.all = np.arange(len(self.joints))
-        self.arm = arm = ArmSimulation(UR5Config(), len(self.joints))
+        self.arm = arm = Simulation(UR5Config(), len(self.joints))
         arm.reset(self.all, [TableScene("empty", (), arm.body.arm.home)] * len(self.joints), self.all.tolist())
         self.cerebellum: Any = arm.cerebellum
         self.true: list[Array] = []

@@ -11,8 +11,8 @@ from bhd_lerobot.bodies.tabletop import TableObject, TableScene
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.policies.manipulation.grasp import pointing_down
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from tests.robots.forces import Contacts
 
 FIRST = np.zeros(1, np.intp)
@@ -25,7 +25,7 @@ class Hand:
     """A UR5 that holds a box over the table, with the force between both at every tick."""
 
     def __init__(self, fixtures: tuple[Shape, ...] = (), box: TableObject = BOX, **config: Any) -> None:
-        self.arm = arm = ArmSimulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
+        self.arm = arm = Simulation(UR5Config(**config), 1, threads=1, fixtures=fixtures)
         arm.reset(FIRST, [TableScene("box", (box,), arm.body.arm.home)], [0])
         self.limits = self.watchdog = self._goals = 0
         self.forces: list[float] = []

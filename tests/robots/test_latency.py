@@ -15,9 +15,9 @@ from bhd_lerobot.control.commands import BrainCommand, Goals, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.latency import MAX_LATENCY, LatePlant
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.parts.latency import MAX_LATENCY, LatePlant
 from tests.cases import each_case
 
 ARM = ur5()
@@ -110,10 +110,10 @@ class Declared(UR5Config):
         return dataclasses.replace(body, arm=dataclasses.replace(body.arm, latency_s=self.latency_s))
 
 
-def late_arms(latency: float, declared: bool, n: int = SIMS, **options: Any) -> ArmSimulation:
+def late_arms(latency: float, declared: bool, n: int = SIMS, **options: Any) -> Simulation:
     config = Declared(max_force=float("inf"))
     config.latency_s = latency if declared else 0.0
-    arms = ArmSimulation(config, n, threads=1, **options)
+    arms = Simulation(config, n, threads=1, **options)
     scene = TableScene("empty", (), arms.body.arm.home, variation=Variation(latency_s=latency))
     arms.reset(np.arange(n), [scene] * n, range(n))
     return arms

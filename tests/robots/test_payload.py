@@ -13,9 +13,9 @@ from bhd_lerobot.control.geometry.dynamics import ArmDynamics, acceleration_shar
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots import arm_simulation
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host import simulation
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.sim.world import World
 
 FIRST = np.zeros(1, np.intp)
@@ -24,7 +24,7 @@ EFFORT = np.array(ur5().limits.effort[:6])
 BODY = '<body name="payload" pos="0 0 0.150"><inertial pos="0 0 0" mass="{}" diaginertia="1e-3 1e-3 1e-3"/></body>'
 
 
-def carrying(monkeypatch: pytest.MonkeyPatch, mass: float, declared: float) -> ArmSimulation:
+def carrying(monkeypatch: pytest.MonkeyPatch, mass: float, declared: float) -> Simulation:
     """Return an arm whose tool carries a mass [kg], which its gravity compensation knows nothing of."""
 
     def make(body: Body, *arguments: object, **options: object) -> World:
@@ -33,8 +33,8 @@ def carrying(monkeypatch: pytest.MonkeyPatch, mass: float, declared: float) -> A
         world.model_field("body_gravcomp")[:, world.model.body("payload").id] = 0.0
         return world
 
-    monkeypatch.setattr(arm_simulation, "World", make)
-    return ArmSimulation(UR5Config(payload=declared), threads=1)
+    monkeypatch.setattr(simulation, "World", make)
+    return Simulation(UR5Config(payload=declared), threads=1)
 
 
 def goals(count: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -8,9 +8,9 @@ from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from tests.cases import each_case
 
 # Ticks and physics steps a second.
@@ -19,8 +19,8 @@ BOX = (Shape("box", 0.25, 0.45, 0.0, 0.2, 0.1, 0.8),)
 POSTURES, LIGHT_N, MOST_FREE_N = 6, 20.0, 80.0
 
 
-def start(n: int, control_hz: int, physics_hz: int, fixtures: tuple[Shape, ...] = ()) -> ArmSimulation:
-    arm = ArmSimulation(UR5Config(control_hz=control_hz, physics_hz=physics_hz), n, threads=1, fixtures=fixtures)
+def start(n: int, control_hz: int, physics_hz: int, fixtures: tuple[Shape, ...] = ()) -> Simulation:
+    arm = Simulation(UR5Config(control_hz=control_hz, physics_hz=physics_hz), n, threads=1, fixtures=fixtures)
     arm.reset(np.arange(n), [TableScene("empty", (), arm.body.arm.home)] * n, [0] * n)
     return arm
 

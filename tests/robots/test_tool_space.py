@@ -12,9 +12,10 @@ from bhd_lerobot.bodies.ur5 import JOINTS
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Reason
-from bhd_lerobot.robots.arm_host import TOOL_NAMES, pose_matrices
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.parts.arm import pose_matrices
+from bhd_lerobot.robots.parts.names import TOOL_NAMES
 from bhd_lerobot.robots.ur5 import UR5
 
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
@@ -35,7 +36,7 @@ def test_quaternions_near_unit_length_are_normalised_and_others_refused() -> Non
 
 
 def test_the_observed_tool_pose_is_that_of_the_observed_joints_with_their_noise() -> None:
-    arm = ArmSimulation(UR5Config(tool_pose=True), 2, threads=1)
+    arm = Simulation(UR5Config(tool_pose=True), 2, threads=1)
     noisy = replace(Variation(), sensor_noise=0.01)
     scenes = [TableScene("empty", (), arm.body.arm.home, variation=variation) for variation in (Variation(), noisy)]
     arm.reset(np.arange(2), scenes, [0, 1])
@@ -53,10 +54,10 @@ def test_the_observed_tool_pose_is_that_of_the_observed_joints_with_their_noise(
 
 @pytest.fixture(scope="module")
 def simulation():
-    return ArmSimulation(UR5Config(action_space="tool"), 3, threads=1)
+    return Simulation(UR5Config(action_space="tool"), 3, threads=1)
 
 
-def start(simulation: ArmSimulation) -> np.ndarray:
+def start(simulation: Simulation) -> np.ndarray:
     """Put all arms home; return the action that keeps them there."""
     ids = np.arange(simulation.n)
     scenes = [TableScene("empty", (), simulation.body.arm.home)] * simulation.n
@@ -126,7 +127,7 @@ def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
     words and in the recorded flags, and the arm holds the last pose; the stream back is taken again.
     """
     axes = [sign * np.array(axis) for axis in itertools.product((0, 1), repeat=3) if any(axis) for sign in (1, -1)]
-    simulation = ArmSimulation(UR5Config(action_space="tool"), len(axes), threads=1)
+    simulation = Simulation(UR5Config(action_space="tool"), len(axes), threads=1)
     action = start(simulation)
     place = action[:, :3].copy()
     first = [pose_matrices(row[:7])[0][:3, :3] for row in action]
@@ -150,7 +151,7 @@ def test_a_tool_that_turns_on_the_spot_stays_on_the_spot() -> None:
 
 @pytest.mark.thorough
 def test_the_last_joint_does_not_unwind_by_a_turn() -> None:
-    simulation = ArmSimulation(UR5Config(action_space="tool"), 1, threads=1)
+    simulation = Simulation(UR5Config(action_space="tool"), 1, threads=1)
     action = start(simulation)
     rotation = pose_matrices(action[0, :7])[0][:3, :3]
     last, most = simulation.cerebellum.command[0, 5], 0.0
@@ -168,7 +169,7 @@ def test_the_last_joint_does_not_unwind_by_a_turn() -> None:
 
 def test_the_poses_of_a_chunk_follow_each_other() -> None:
     """Each is solved from the one before it, not from where the arm is now."""
-    simulation = ArmSimulation(UR5Config(action_space="tool"), 1, threads=1)
+    simulation = Simulation(UR5Config(action_space="tool"), 1, threads=1)
     action = start(simulation)
     before = simulation.cerebellum.command[0, :6].copy()
     rotation = pose_matrices(action[0, :7])[0][:3, :3]
@@ -187,7 +188,7 @@ def test_the_poses_of_a_chunk_follow_each_other() -> None:
 def test_a_stream_whose_poses_were_refused_is_taken_again_only_near_to_the_tool() -> None:
     """Streams of 0.2 m/s that leave the workspace and come back to it elsewhere, and then to where they left it."""
     corners = ([(0.60, -0.79, 0.73), (-0.60, -0.22, 0.22)], [(0.89, 0.51, 0.39), (-0.14, 0.68, 0.05)])
-    simulation = ArmSimulation(UR5Config(action_space="tool"), len(corners), threads=1)
+    simulation = Simulation(UR5Config(action_space="tool"), len(corners), threads=1)
     action, step = start(simulation), 0.2 / simulation.rates.fps
     paths, frames = [], 0
     for place, ends in zip(action[:, :3], corners, strict=True):
@@ -221,7 +222,7 @@ def test_a_stream_whose_poses_were_refused_is_taken_again_only_near_to_the_tool(
 
 def test_after_refusals_the_first_pose_has_to_be_near_to_the_tool() -> None:
     """Without a refusal a pose may be further away, and in a fast stream a single refusal does not end it."""
-    simulation = ArmSimulation(UR5Config(action_space="tool"), 1, threads=1)
+    simulation = Simulation(UR5Config(action_space="tool"), 1, threads=1)
 
     def answer(y: float, x: float = 0.0) -> tuple[int, str]:
         report = simulation.step(home + np.array([[x, y, 0, 0, 0, 0, 0, 0]]))

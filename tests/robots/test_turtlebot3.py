@@ -10,8 +10,8 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from tests.cases import each_case
 
@@ -73,7 +73,7 @@ def test_the_returned_action_is_what_the_base_was_commanded(robot):
 
 
 def test_true_speeds_stay_within_five_per_cent_of_the_limits():
-    base = BaseSimulation(TurtleBot3Config(beams=36, arena="empty"))
+    base = Simulation(TurtleBot3Config(beams=36, arena="empty"))
     drive, (speed, turn) = base.body.drive, base.body.limits.velocity
     rng = np.random.default_rng(0)
     full = np.array([speed, turn])

@@ -8,9 +8,9 @@ import pytest
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RenderingError
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.ur5 import UR5
 from tests.cases import each_case
 
@@ -74,7 +74,7 @@ def test_a_tool_pose_that_cannot_be_taken_is_refused_with_the_reason(tmp_path):
 
 
 def test_noise_and_latency_belong_to_the_episode(tmp_path):
-    simulation = ArmSimulation(UR5Config(), 2)
+    simulation = Simulation(UR5Config(), 2)
     home = simulation.body.arm.home
     wild = TableScene("empty", (), home, variation=Variation(sensor_noise=0.001, latency_s=0.02))
     simulation.reset(np.arange(2), [wild, TableScene("empty", (), home)], [7, 7])
@@ -151,7 +151,7 @@ def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path):
 
 
 def test_an_impedance_with_too_much_latency_is_refused():
-    simulation = ArmSimulation(UR5Config(control="impedance", action_space="tool"))
+    simulation = Simulation(UR5Config(control="impedance", action_space="tool"))
     late = TableScene("empty", (), simulation.body.arm.home, variation=Variation(latency_s=0.011))
     with pytest.raises(ConfigError, match=r"latency_s is 0\.011"):
         simulation.reset(FIRST, [late], [0])

@@ -13,10 +13,9 @@ from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control import kernels
 from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
 from bhd_lerobot.errors import SimulationError
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.sim import frames
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.variation import RandomisationConfig
@@ -42,9 +41,9 @@ def count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-def make(n: int, threads: int | None = None, **options: Any) -> BaseSimulation:
+def make(n: int, threads: int | None = None, **options: Any) -> Simulation:
     config = TurtleBot3Config(beams=90, odometry=True, **options)
-    simulation = BaseSimulation(config, n, threads)
+    simulation = Simulation(config, n, threads)
     arenas = [make_arena("random", sim, robot_radius=0.105) for sim in range(n)]
     simulation.reset(np.arange(n), arenas, list(range(n)))
     return simulation
@@ -102,7 +101,7 @@ class Reacher:
 
     def __init__(self, n: int, threads: int | None, options: dict[str, Any]) -> None:
         config = UR5Config(**options)
-        self.arm = ArmSimulation(config, n, threads)
+        self.arm = Simulation(config, n, threads)
         self.task = PickTask(
             PickConfig(randomisation=RandomisationConfig(enabled=True, latency_s=0.01)), n, config.fps, config.body()
         )
@@ -218,7 +217,7 @@ FIELDS = ("xfrc_applied", "qacc_warmstart", "ncon", "xquat", "qfrc_bias", "actua
 def test_whatever_is_read_of_a_world_the_physics_is_the_same(count: int) -> None:
     """Fields of the state, numbers, derived fields, and more of these than frames copy."""
 
-    def fields(simulation: BaseSimulation) -> dict[str, NDArray[np.float64]]:
+    def fields(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
         names = [*FIELDS, *(name for name in simulation.world.one._all_fields if name.startswith("x"))][:count]
         return {name: simulation.world.derived(name) for name in names}
 
@@ -241,7 +240,7 @@ def test_whatever_is_read_of_a_world_the_physics_is_the_same(count: int) -> None
 
 @pytest.mark.usefixtures("compiled")
 def test_what_a_subclass_does_after_steps_is_done() -> None:
-    class Counting(BaseSimulation):
+    class Counting(Simulation):
         steps = 0
 
         def _after_step(self) -> None:

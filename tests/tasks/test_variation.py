@@ -21,9 +21,9 @@ from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.latency import MAX_LATENCY
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.parts.latency import MAX_LATENCY
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
@@ -123,7 +123,7 @@ def test_a_delay_may_be_the_same_in_every_episode() -> None:
 
 def test_to_the_simulator_and_the_judge_a_camera_error_is_nothing() -> None:
     off = dataclasses.replace(ON, camera_error_m=[0.01, -0.02, 0.1])
-    simulation = ArmSimulation(UR5Config(), 2, threads=1)
+    simulation = Simulation(UR5Config(), 2, threads=1)
 
     def run(randomisation: RandomisationConfig) -> list[Episode]:
         task = PickTask(PickConfig(duration_s=1.0, min_objects=3, randomisation=randomisation), 2, 25)

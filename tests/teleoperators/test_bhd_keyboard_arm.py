@@ -18,9 +18,9 @@ from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.realtime.estop import KEYS as ESTOP_KEYS
-from bhd_lerobot.robots.arm_host import TOOL_NAMES
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.parts.names import TOOL_NAMES
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.robots.ur5 import UR5
 from bhd_lerobot.rollout.marks import TELEOP_KEYS

@@ -21,6 +21,9 @@ class MobileArmController(Controller):
 
     A command is the arm's, then the drive's. While a goal of the arm is followed, the base comes to rest.
 
+    Attributes:
+        goals: the goals of the arms.
+
     Args:
         arm: the arms' controller.
         drive: the bases', on the records of the arms'.
@@ -28,7 +31,7 @@ class MobileArmController(Controller):
 
     def __init__(self, arm: ArmController, drive: BaseController) -> None:
         super().__init__(len(arm.states), arm)
-        self.arm, self.drive, states = arm, drive, arm.states
+        self.arm, self.drive, self.goals, states = arm, drive, arm.goals, arm.states
         self.arms, self.arm_limits, self.geometries = arm.arms, arm.arm_limits, arm.geometries
         self.monitors = drive.monitors
         self.width, self.joints = arm.width + drive.width, arm.joints + drive.joints

@@ -1,7 +1,6 @@
 """n robots under one cerebellum: what a LeRobot `Robot`, the batched runs and a real robot are all made of."""
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, is_dataclass
@@ -12,33 +11,42 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body, without_jerk_limits
+from bhd_lerobot.bodies.truth import truth_of
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Chunk, Command, Goals
+from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
+from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Clock, Deliver, Frame, FrameReport
+from bhd_lerobot.robots.parts.part import Part, Refused
 
 
-class Host(ABC):
+class Host:
     """n robots of one kind: what they observe, how they act, goals and modes. It needs no world.
 
     Each is in an episode of its own, which nothing outside it can change: not the number of the others, not what they
-    do. A subclass states what is observed; a simulation adds a world, see `bhd_lerobot.robots.host.simulation`.
+    do. What is observed, and how they act, say its parts; a simulation adds a world, see `Simulation`.
 
     Args:
-        config: the robot's configuration.
-        cerebellum: what controls the robots.
-        action_names: names of the action's floats, in order.
-        observation_names: names of the observation's floats, in order.
+        config: the robot's configuration, which says its body.
+        plant: what moves it.
+        planning: who plans goals; they are planned in the tick that they start in if None.
         camera_names: the cameras that are observed.
-        bridge: how commands get to the cerebellum; a `LockstepBridge` that advances this host if None.
 
     Attributes:
         n: how many robots.
         rates: the rates.
         body: the robot's hardware.
+        parts: its arm and its drive, as far as it has them.
+        cerebellum: what controls the robots.
+        bridge: how commands get to the cerebellum.
+        action_names: names of the action's floats, in order.
+        observation_names: names of the observation's floats, in order.
         running: which robots are in an episode, shape (n,).
         tick: control ticks that have gone by.
         world: the simulated world, which can be placed, stored and rendered; None of a real robot.
@@ -48,51 +56,96 @@ class Host(ABC):
         sensor_period_s: time between two readings of the slowest sensor [s]; 0 if all are read at every tick.
     """
 
-    action_names: tuple[str, ...]
     world: Any = None
     clock: Clock | None = None
-    knows: frozenset[str] | None = frozenset()
-    sensor_period_s = 0.0
 
     def __init__(
-        self,
-        config: Any,
-        cerebellum: Cerebellum,
-        *,
-        action_names: Sequence[str],
-        observation_names: Sequence[str],
-        camera_names: Sequence[str] = (),
-        bridge: LockstepBridge | None = None,
+        self, config: Any, plant: Plant, planning: Planning | None = None, *, camera_names: Sequence[str] = ()
     ) -> None:
-        n = cerebellum.n
-        self.config, self.n, self.rates, self.body = config, n, config.rates, cerebellum.body
-        self.cerebellum = cerebellum
-        self.bridge = bridge or LockstepBridge(cerebellum, self.rates, self.advance, self.run_ticks)
-        self.action_names, self.observation_names = tuple(action_names), tuple(observation_names)
+        self.config, self.plant, self.rates = config, plant, config.rates
+        self.n = n = plant.n
+        body: Body = config.body()
+        self.body = body = body if config.jerk_limits else without_jerk_limits(body)
+        self.parts: list[Part] = self._make_parts(planning)
+        sensors = sum(part.sensors for part in self.parts)
+        self.cerebellum = Cerebellum(body, plant, config.control_hz, _one(self.parts), sensors=sensors)
+        self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance, self.run_ticks)
+        self.action_names = tuple(name for part in self.parts for name in part.action_names)
+        self.observation_names = tuple(name for part in self.parts for name in part.observation_names)
         self.camera_names = tuple(camera_names)
+        known = [part.knows for part in self.parts]
+        self.knows: frozenset[str] | None = known[0].union(*known[1:]) if self.world is None else None
+        self.sensor_period_s = max(part.sensor_period_s for part in self.parts)
+        for part in self.parts:
+            part.host = self
+        self._actions, self._commands = _columns(self.parts)
         self.running = np.ones(n, np.bool_)
         self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
         self._no_physics = np.zeros((n, 0)), np.zeros((n, 0))
+
+    def _make_parts(self, planning: Planning | None) -> list[Any]:
+        """Return the parts of the body: the arm's commands come before the drive's."""
+        parts: list[Part] = []
+        if self.body.arm is not None:
+            from bhd_lerobot.robots.parts.arm import ArmPart  # imports Pinocchio, which a base does without
+
+            parts.append(ArmPart(self.config, self.body, self.plant, planning))
+        if self.body.drive is not None:
+            from bhd_lerobot.robots.parts.drive import DrivePart
+
+            arm = parts[0].controller if parts else None
+            parts.append(DrivePart(self.config, self.body, self.plant, arm))
+        return parts
+
+    @property
+    def controller(self) -> Any:
+        """What turns commands into actuator commands."""
+        return self.cerebellum.controller
+
+    @property
+    def kinematics(self) -> Any:
+        """The arm's kinematics, an `ArmKinematics`."""
+        return self._part("kinematics").kinematics
+
+    def _part(self, name: str) -> Any:
+        """Return the part that has something.
+
+        Raises:
+            ConfigError: none has it.
+        """
+        for part in self.parts:
+            if hasattr(part, name):
+                return part
+        raise ConfigError(f"The robot {self.body.name!r} has no {name}.")
 
     @property
     def camera_shapes(self) -> dict[str, tuple[int, int, int]]:
         """Image shapes (height, width, channels) [px] of the cameras that are observed, by name."""
         return dict.fromkeys(self.camera_names, (self.config.camera_height, self.config.camera_width, 3))
 
-    # --- what a subclass defines -------------------------------------------------------------------------------------
+    # --- what its parts say ------------------------------------------------------------------------------------------
 
-    @abstractmethod
+    def read(self) -> PlantReading:
+        """Return the newest reading of the joints."""
+        return self.cerebellum.reading
+
     def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
+        reading = self.read()
+        if len(self.parts) == 1:
+            return self.parts[0].sense(reading), self.parts[0].oldest()
+        floats = np.concatenate([part.sense(reading) for part in self.parts], axis=1)
+        return floats, np.minimum.reduce([part.oldest() for part in self.parts])
 
-    @abstractmethod
     def truth(self) -> Any:
         """Return what a task judges by, as far as it is known; touches since the start of the last frame."""
+        reading = self.read()
+        return truth_of({name: value for part in self.parts for name, value in part.truth(reading).items()})
 
-    @abstractmethod
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where the robot was in recorded states, shape (frames, 7); see `Robots.track`."""
+        return self.parts[-1].track(states)
 
     @property
     def touches(self) -> tuple[NDArray[np.bool_], ...]:
@@ -101,11 +154,12 @@ class Host(ABC):
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Take over what is known of the scenes that robots are in; a simulation puts them there."""
-        return
+        for part in self.parts:
+            part.place(ids, scenes)
 
     def start_goal(self, scene: Any) -> BrainCommand | None:
         """Return the goal that brings a robot without a world to the start of a scene; None if a person does that."""
-        return None
+        return next((goal for part in self.parts if (goal := part.start_goal(scene)) is not None), None)
 
     def show(self, row: Any) -> None:
         """Take over what the process of a robot on the wall clock published beside its record."""
@@ -113,11 +167,14 @@ class Host(ABC):
 
     def to_action(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return commands of the cerebellum, shape (n, width), in the space of the actions, shape (n, actions)."""
-        return command.copy()
+        if len(self.parts) == 1:
+            return self.parts[0].to_action(command)
+        pairs = zip(self.parts, self._commands, strict=True)
+        return np.concatenate([part.to_action(command[:, columns]) for part, columns in pairs], axis=1)
 
     def to_setpoints(
         self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
-    ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+    ) -> tuple[NDArray[np.float64], Refused]:
         """Turn actions into setpoints of the cerebellum, shape (n, width), and say which cannot be, and why.
 
         Args:
@@ -125,7 +182,15 @@ class Host(ABC):
             mask: the robots that they are for, shape (n,).
             before: the setpoints before these, shape (n, width); the present commands if None.
         """
-        return action, {}
+        before = self.cerebellum.command if before is None else before
+        if len(self.parts) == 1:
+            return self.parts[0].to_setpoints(action, mask, before)
+        made, refused = [], {}
+        for part, ours, columns in zip(self.parts, self._actions, self._commands, strict=True):
+            setpoints, problems = part.to_setpoints(action[:, ours], mask, before[:, columns])
+            made.append(setpoints)
+            refused.update(problems)
+        return np.concatenate(made, axis=1), refused
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
@@ -143,6 +208,8 @@ class Host(ABC):
         ids = np.asarray(ids, np.intp)
         self.place(ids, scenes)
         self.bridge.restart(ids)
+        for part in self.parts:
+            part.begin(ids)
         self._start_tick[ids] = self.tick
         self.running[ids] = True
         return np.zeros((len(ids), 0))
@@ -358,6 +425,23 @@ class Host(ABC):
     def close(self) -> None:
         """Free everything. May be called twice."""
         return
+
+
+def _one(parts: Sequence[Part]) -> Controller:
+    """Return the controller of all parts."""
+    if len(parts) == 1:
+        return parts[0].controller
+    from bhd_lerobot.control.arm.mobile import MobileArmController
+
+    arm, drive = (part.controller for part in parts)
+    return MobileArmController(arm, drive)  # type: ignore[arg-type]
+
+
+def _columns(parts: Sequence[Part]) -> tuple[list[slice], list[slice]]:
+    """Return where the parts' values are in an action and in a command."""
+    widths = [len(part.action_names) for part in parts], [part.controller.width for part in parts]
+    actions, commands = ([slice(sum(w[:k]), sum(w[: k + 1])) for k in range(len(w))] for w in widths)
+    return actions, commands
 
 
 LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor")

@@ -296,7 +296,7 @@ def _kind(simulation: type[Simulation], config: Any) -> tuple[Any, list[Any]]:
     if not config.plant:
         return simulation, [config]
     plant_class(config.plant)  # what cannot be imported is found out before a process is started
-    return simulation.host_class, [config, Unconnected()]
+    return Host, [config, Unconnected()]
 
 
 def mirror_of(simulation: type[Simulation], config: Any) -> Host:
@@ -314,7 +314,7 @@ def make_live(simulation: type[Simulation], config: Any, name: str | None) -> Li
     """Return a robot on the wall clock: a simulated one, or with `config.plant` that of a plant.
 
     Args:
-        simulation: the class of its simulation, which names that of its host.
+        simulation: the class of its simulation.
         config: its configuration.
         name: the robot's id; its type and this process's number if None.
 

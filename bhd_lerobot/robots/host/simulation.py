@@ -1,20 +1,25 @@
 """n simulated robots: a host with a world."""
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.cerebellum import Cerebellum
+from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S
 from bhd_lerobot.control.commands import Command
+from bhd_lerobot.control.motion.planning import Planning
+from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Acceptance, Deliver, FrameReport
+from bhd_lerobot.robots.parts.latency import LatePlant
+from bhd_lerobot.robots.parts.part import GYROSCOPE, SimulatedPart
 from bhd_lerobot.sim.camera import Camera
 from bhd_lerobot.sim.frames import Frames
+from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.render_thread import RenderThread
 from bhd_lerobot.sim.world import Snapshot, World
 
@@ -22,81 +27,127 @@ from bhd_lerobot.sim.world import Snapshot, World
 SENSOR_STREAM = 1
 _NONE = np.zeros(0, np.intp)
 _HOOKS = ("advance", "_after_step", "_after_tick", "run_ticks")
-_PACKAGE = __name__.partition(".")[0]
 
 
 class Simulation(Host):
     """n simulated robots of one kind.
 
-    Nothing outside an episode can change it, not even the number of threads. A subclass makes world and cerebellum,
-    passes them on to this constructor, and defines what is sensed and what is true.
+    Nothing outside an episode can change it, not even the number of threads.
 
     Args:
         config: the robot's configuration.
-        cerebellum: what controls the robots.
-        world: the physics, of n robots.
-        options: those of `Host`.
+        n: how many.
+        threads: threads that step the physics; all processors if None.
+        planning: who plans goals; they are planned in the tick that they start in if None.
+        fixtures: what stands immovable on the tables of arms, unknown to them.
 
     Attributes:
-        host_class: the class of its host without a world, for a plant of its own.
+        rngs: random numbers of each robot's sensors.
         view: the camera outside of the robot, for videos.
         video_speed: how much faster than the robot was a video of it is shown.
         on_change: is called at the start of episodes, with robots and scenes, and with none of them at the end of a
             frame.
     """
 
-    host_class: ClassVar[type[Host]]
-    view = "overview"
-    video_speed = 1
-    knows = None
     world: World
+    parts: list[SimulatedPart]  # type: ignore[assignment]
     on_change: Callable[[NDArray[np.intp], Sequence[Any]], None] | None = None
 
-    def __init__(self, config: Any, cerebellum: Cerebellum, *, world: World, **options: Any) -> None:
-        self.world = world
-        super().__init__(config, cerebellum, **options)
+    def __init__(
+        self,
+        config: Any,
+        n: int = 1,
+        threads: int | None = None,
+        planning: Planning | None = None,
+        *,
+        fixtures: Sequence[Shape] = (),
+    ) -> None:
+        body = config.body()
+        self.world = world = World(body, n, physics_hz=config.physics_hz, threads=threads, fixtures=fixtures)
+        self.rngs = [np.random.default_rng(0) for _ in range(n)]
+        joints, plant = SimulatedPlant(world), None
+        if body.arm is not None:
+            plant = LatePlant(joints, len(body.joints), round(MAX_LATENCY_S * config.control_hz))
+        names = tuple(body.cameras) if config.camera else ()
+        super().__init__(config, plant or joints, planning, camera_names=names)
+        self.view, self.video_speed = ("overview", 1) if body.drive is None else ("follow", 4)
+        self._touches = np.zeros((sum(part.touch_kinds for part in self.parts), n), np.bool_)
+        first = 0
+        for part in self.parts:
+            part.touches = self._touches[first : (first := first + part.touch_kinds)]
+        self._reading = PlantReading(n, self.controller.joints)
+        gyro = {"gyro": GYROSCOPE, "beams": config.beams} if body.drive is not None and config.imu else {}
+        self._frames = Frames(world, self.cerebellum, self._touches, late=plant, brakes=joints.brakes, **gyro)
         self._active: NDArray[np.intp] | None = None
-        self._rngs = [np.random.default_rng(0) for _ in range(self.n)]
         self._camera: Camera | None = None
         self._render_thread: RenderThread | None = None
-        self._frames: Frames | None = None
 
-    # --- what a subclass defines -------------------------------------------------------------------------------------
+    def _make_parts(self, planning: Planning | None) -> list[Any]:
+        body, plant, parts = self.body, self.plant, list[SimulatedPart]()
+        if isinstance(plant, LatePlant):
+            from bhd_lerobot.robots.parts.simulated_arm import SimulatedArm  # imports Pinocchio
 
-    @abstractmethod
+            parts.append(SimulatedArm(self.config, body, plant, self.world, planning))
+        if body.drive is not None:
+            from bhd_lerobot.robots.parts.simulated_drive import SimulatedDrive
+
+            arm = parts[0].controller if parts else None
+            parts.append(SimulatedDrive(self.config, body, plant, self.world, arm))
+        return parts
+
+    @property
+    def table(self) -> Any:
+        """What lies on the tables of arms, a `Tabletop`."""
+        return self._part("table").table
+
+    @property
+    def lidar(self) -> Any:
+        """The range finders of bases, a `Lidar`."""
+        return self._part("lidar").lidar
+
+    def read(self) -> PlantReading:
+        """Return the joints as they are now."""
+        self.plant.read(self._reading)
+        return self._reading
+
+    @property
+    def touches(self) -> tuple[NDArray[np.bool_], ...]:
+        """What was touched since the start of the last frame, by kind, live, each of shape (n,).
+
+        By an arm the table, objects with one of its links, and the arm itself; then by a base the scene.
+        """
+        return tuple(self._touches)
+
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Put robots into scenes, at rest at their start; `reset` does that and starts an episode."""
-
-    @classmethod
-    def start_scene(cls, config: Any) -> Any:
-        """Return the scene that a configuration describes, for a robot that is used by itself."""
-        raise NotImplementedError(f"{cls.__name__} has no start_scene.")
+        for part in reversed(self.parts):  # an arm's objects stand on what is in the arena
+            part.place(ids, scenes)
+        self._touches[:, ids] = False
 
     def privileged_state(self) -> NDArray[np.float64]:
         """Return what is true and no sensor measures, numbers around 1, shape (n, any); for a critic."""
-        return np.zeros((self.n, 0))
-
-    def _started(self, ids: NDArray[np.intp], seeds: Sequence[int]) -> None:
-        """Take first readings of what is not read every frame, at the start of episodes."""
-        return
+        return np.concatenate([part.privileged_state() for part in self.parts], axis=1)
 
     def _after_step(self) -> None:
         """Do what a physics step brings with it: a touch may last a single one."""
-        return
+        for part in self.parts:
+            part.after_step()
 
     def _after_tick(self) -> None:
         """Do what a tick brings with it: sensors with a rhythm of their own."""
-        return
+        for part in self.parts:
+            part.after_tick()
 
     # --- episodes ----------------------------------------------------------------------------------------------------
 
     def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start episodes, see `Host.reset`; the noise of the sensors follows from the seeds."""
         for sim, seed in zip(ids, seeds, strict=True):
-            self._rngs[sim] = np.random.default_rng(np.random.SeedSequence([SENSOR_STREAM, seed]))
+            self.rngs[sim] = np.random.default_rng(np.random.SeedSequence([SENSOR_STREAM, seed]))
         super().reset(ids, scenes, seeds)
         self._active = None if self.running.all() else np.flatnonzero(self.running)
-        self._started(np.asarray(ids, np.intp), seeds)
+        for part in self.parts:
+            part.started(np.asarray(ids, np.intp))
         if self.on_change is not None:
             self.on_change(np.asarray(ids, np.intp), scenes)
         return self.snapshot(ids).state
@@ -133,8 +184,7 @@ class Simulation(Host):
 
     def close(self) -> None:
         """Free renderers and threads. May be called twice."""
-        if self._frames is not None:
-            self._frames.close()
+        self._frames.close()
         if self._render_thread is not None:
             self._render_thread.close()
             self._render_thread = None
@@ -160,7 +210,7 @@ class Simulation(Host):
     @property
     def not_in_state(self) -> tuple[str, ...]:
         """Observed features that do not follow from a physics state."""
-        return ()
+        return tuple(name for part in self.parts for name in part.not_in_state)
 
     def resense(self, sim: int, time_s: float, age_s: float) -> None:
         """Read again, in a restored state, what is not read every frame.
@@ -170,7 +220,8 @@ class Simulation(Host):
             time_s: when the state was recorded, since the episode's start [s].
             age_s: how old the oldest reading was then [s].
         """
-        return
+        for part in self.parts:
+            part.resense(sim, time_s, age_s)
 
     def snapshot(self, ids: NDArray[np.intp] | None = None) -> Snapshot:
         """Return the physics of simulations: to continue from there with the same commands, bit-exactly."""
@@ -185,20 +236,18 @@ class Simulation(Host):
         self._after_tick()
 
     def run_ticks(self, number: int, most: int) -> int:
-        """Run ticks in machine code, see `LockstepBridge`; none where a subclass of ours does something in between."""
-        frames = self._frames
-        if frames is None or not self._is_plain or any(hook in vars(self) for hook in _HOOKS):
+        """Run ticks in machine code, see `LockstepBridge`; none where somebody does something in between."""
+        if not self._is_plain or any(hook in vars(self) for hook in _HOOKS):
             return 0
-        if not frames.run(self._active, number, most):
+        left = [ticks for part in self.parts if (ticks := part.ticks_left())]
+        ticks = min([most, *left])
+        if not self._frames.run(self._active, number, ticks):
             return 0
-        self.tick += most
+        self.tick += ticks
         self._after_tick()
-        return most
+        return ticks
 
     @cached_property
     def _is_plain(self) -> bool:
-        """Whether nothing but its own class does something after steps and ticks."""
-        own = next(
-            kind for kind in type(self).__mro__ if kind.__module__.startswith(_PACKAGE) and "place" in vars(kind)
-        )
-        return all(getattr(type(self), hook) is getattr(own, hook) for hook in _HOOKS)
+        """Whether nothing but this class does something after steps and ticks."""
+        return all(getattr(type(self), hook) is getattr(Simulation, hook) for hook in _HOOKS)

@@ -92,7 +92,7 @@ def serve(
         return made
 
     try:
-        scene = simulation.start_scene(config.robot)
+        scene = config.robot.start_scene()
         state = run_service(
             config,
             simulation,

@@ -50,7 +50,7 @@ class Robot:
         self.block = LiveLayout(dtype, 8).create(name, about)
         self.block.words[Word.PHASE] = Phase.RUNNING
         self.state = np.zeros((), dtype)
-        self.scene: Any = type(self.simulation).start_scene(config)
+        self.scene: Any = config.start_scene()
 
     def place(self) -> None:
         self.simulation.reset(np.zeros(1, np.intp), [self.scene], [0])

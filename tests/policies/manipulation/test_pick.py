@@ -11,8 +11,8 @@ from bhd_lerobot.control.commands import CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
-from bhd_lerobot.robots.arm_simulation import ArmSimulation
 from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.cases import each_case
@@ -198,7 +198,7 @@ def test_it_picks() -> None:
 class Thief(PickBrain):
     """Moves the object away when the gripper comes down for the first time, across the line of its fingers."""
 
-    def __init__(self, simulation: ArmSimulation) -> None:
+    def __init__(self, simulation: Simulation) -> None:
         super().__init__()
         self.simulation, self.moved = simulation, False
 
@@ -216,7 +216,7 @@ class Thief(PickBrain):
 
 
 def test_an_object_that_moves_away_under_the_gripper_is_picked_at_the_second_attempt() -> None:
-    simulation = ArmSimulation(UR5Config(), 1, threads=1)
+    simulation = Simulation(UR5Config(), 1, threads=1)
     brain = Thief(simulation)
     config = PickConfig(max_objects=1, duration_s=30.0)
     episode = episodes(brain, PickTask, config, [episode_seed(5, 0, "train")], simulation=simulation)[0]

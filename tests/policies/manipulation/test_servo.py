@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.servo import PickServoBrain, PickServoConfig, ReachServoBrain, ServoConfig
-from bhd_lerobot.robots.arm_host import TOOL_NAMES
+from bhd_lerobot.robots.parts.names import TOOL_NAMES
 from bhd_lerobot.tasks.pick import ENVIRONMENT, PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event, episode_seed

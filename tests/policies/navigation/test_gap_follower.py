@@ -13,8 +13,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.clearance import QUANTUM, ClearanceTable, Footprint, Level, make_paths
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain, GapFollowerConfig
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
@@ -237,7 +237,7 @@ def test_an_obstacle_on_a_path_is_met_where_the_path_comes_to_it() -> None:
 
 
 def run(brain: Brain, seeds: list[int], n: int, beams: int = 120, seconds: float = 40.0) -> list[Outcome]:
-    simulation = BaseSimulation(TurtleBot3Config(beams=beams), n)
+    simulation = Simulation(TurtleBot3Config(beams=beams), n)
     loop = EpisodeLoop(simulation, AvoidTask(AvoidConfig(duration_s=seconds, min_path_m=0.0), n, 10), brain)
     return [e.outcome for e in loop.run([EpisodeSpec(index, seed) for index, seed in enumerate(seeds)])]
 
@@ -256,7 +256,7 @@ def test_it_gets_out_of_a_dead_end(beams: int) -> None:
     starts = [(1.3, 0.0, 0.0), (1.1, 0.1, 0.3), (1.1, -0.12, -0.5)]
     arenas = [Arena("dead end", walls, (-2.0, 2.0, -2.0, 2.0), start) for start in starts]
     ids = np.arange(len(starts))
-    simulation = BaseSimulation(TurtleBot3Config(beams=beams), len(ids))
+    simulation = Simulation(TurtleBot3Config(beams=beams), len(ids))
     brain = GapFollowerBrain()
     brain.bind(RobotFeatures(simulation.observation_names, simulation.action_names, 10, body=BURGER))
     simulation.reset(ids, arenas, [1, 2, 3])

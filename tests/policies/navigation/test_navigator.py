@@ -13,8 +13,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.goal_map import CELL, GoalMap
 from bhd_lerobot.policies.navigation.navigator import GOAL, NavigatorBrain, NavigatorConfig
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
@@ -56,7 +56,7 @@ def run(scenes: list[Arena] | list[int], n: int = 8) -> list[Episode]:
             return scene if isinstance(scene, Arena) else super().sample(scene)
 
     config, n = TurtleBot3Config(), min(n, len(scenes))
-    loop = EpisodeLoop(BaseSimulation(config, n), Task(NavigateConfig(), n, config.fps), NavigatorBrain())
+    loop = EpisodeLoop(Simulation(config, n), Task(NavigateConfig(), n, config.fps), NavigatorBrain())
     return list(loop.run([EpisodeSpec(index, index) for index in range(len(scenes))]))
 
 

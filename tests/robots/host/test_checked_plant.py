@@ -11,11 +11,11 @@ from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
-from bhd_lerobot.robots.arm_host import ArmHost
-from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant, plant_class
+from bhd_lerobot.robots.host.host import Host
+from bhd_lerobot.robots.parts.arm import ArmPart
 from bhd_lerobot.tasks.operator import OperatorTask, judged
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
@@ -88,7 +88,7 @@ class Rig:
         self.plant = plant or Perfect()
         self.slept = 0.0
         self.checked = CheckedPlant(self.plant, "mine:Arm", NANOSECONDS, lambda: self.plant.now, self._sleep)
-        self.host = ArmHost(UR5Config(control_hz=125, physics_hz=500), self.checked)
+        self.host = Host(UR5Config(control_hz=125, physics_hz=500), self.checked)
         self.plant.time = lambda: self.host.bridge.now_ns
         self.checked.open()
 
@@ -314,7 +314,7 @@ def test_a_base_observes_what_its_plant_measures() -> None:
     plant = Perfect(sensors=39, start=[0.0, 0.0])
     config = TurtleBot3Config(beams=36, imu=True, odometry=True)
     checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
-    base = BaseHost(config, checked)
+    base = Host(config, checked)
     checked.prepare(base.cerebellum.reading)
     plant.time = lambda: base.bridge.now_ns
     base.reset(FIRST, [None], [0])
@@ -351,7 +351,7 @@ class Twisted(Perfect):
 def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> None:
     plant = Twisted(sensors=36, start=[0.0, 0.0])
     checked = CheckedPlant(plant, "mine:Base", NANOSECONDS, lambda: plant.now)
-    base = BaseHost(TurtleBot3Config(beams=36), checked)
+    base = Host(TurtleBot3Config(beams=36), checked)
     checked.prepare(base.cerebellum.reading)
     plant.time = lambda: base.bridge.now_ns
     base.reset(FIRST, [None], [0])
@@ -368,7 +368,7 @@ def test_a_base_whose_plant_takes_twists_writes_twists_within_its_limits() -> No
 
 
 def test_what_a_robot_does_not_measure_a_person_judges() -> None:
-    knows = ArmHost.knows
+    knows = ArmPart.knows
     assert isinstance(judged(ReachTask(ReachConfig(), 1, 25), knows, 1, 25), ReachTask)
     task = PickTask(PickConfig(duration_s=0.2), 1, 25)
     assert judged(task, None, 1, 25) is task

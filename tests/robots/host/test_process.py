@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.robots.arm_host import ArmHost
-from bhd_lerobot.robots.base_host import BaseHost
 from bhd_lerobot.robots.config import BhdRobotConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
@@ -34,7 +32,7 @@ for spec in pickle.loads(sys.stdin.buffer.read()):
     plant.read(host.cerebellum.reading)
     host.observe(), host.truth(), host.step(None)
 print({"torch", "lerobot", "mujoco"} & set(sys.modules))
-import bhd_lerobot.robots.base_simulation, bhd_lerobot.robots.arm_simulation
+import bhd_lerobot.robots.parts.simulated_arm, bhd_lerobot.robots.parts.simulated_drive
 print({"torch", "lerobot"} & set(sys.modules))
 """
 
@@ -42,16 +40,16 @@ print({"torch", "lerobot"} & set(sys.modules))
 STANDING: Any = {"plant": "standing:Standing", "clock": "realtime"}
 
 
-def spec_of(config: BhdRobotConfig, host: type[Host]) -> LiveSpec:
-    return LiveSpec.of(host(config, Unconnected()), block="")
+def spec_of(config: BhdRobotConfig) -> LiveSpec:
+    return LiveSpec.of(Host(config, Unconnected()), block="")
 
 
 def test_processes_need_neither_torch_nor_lerobot_and_that_of_a_real_robot_no_mujoco(tmp_path: Path) -> None:
     (tmp_path / "standing.py").write_text(PLANT, encoding="utf-8")
     specs = [
-        spec_of(UR5Config(**STANDING), ArmHost),
-        spec_of(UR5Config(control="impedance", action_space="tool", **STANDING), ArmHost),
-        spec_of(TurtleBot3Config(imu=True, **STANDING), BaseHost),
+        spec_of(UR5Config(**STANDING)),
+        spec_of(UR5Config(control="impedance", action_space="tool", **STANDING)),
+        spec_of(TurtleBot3Config(imu=True, **STANDING)),
     ]
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(tmp_path)], input=pickle.dumps(specs), capture_output=True, check=False

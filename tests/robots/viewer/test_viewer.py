@@ -101,7 +101,7 @@ def made(**overrides: object) -> tuple[Simulation, Any]:
     """Return one simulation on the lockstep clock, and its scene."""
     config: Any = parse(RecordConfig, options(Path("unused"), robot__camera="false", **overrides)).robot
     simulation = make_simulation(config)
-    return simulation, type(simulation).start_scene(config)
+    return simulation, config.start_scene()
 
 
 def run(simulation: Simulation, scene: Any, frames: int) -> np.ndarray:

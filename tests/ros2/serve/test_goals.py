@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult
-from bhd_lerobot.robots.base_simulation import BaseSimulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.ros2.serve.goals import BaseGoals
 
 FPS = 10
@@ -22,7 +22,7 @@ class Base:
 
     def __init__(self) -> None:
         self.config = TurtleBot3Config(odometry=True, fps=FPS)
-        self.simulation = BaseSimulation(self.config)
+        self.simulation = Simulation(self.config)
         arena = make_arena("turtlebot3_world", 0, robot_radius=self.config.body().drive.radius)
         self.simulation.reset(np.zeros(1, np.intp), [arena], [0])
         self.rates, self.body = self.simulation.rates, self.simulation.body

@@ -1,17 +1,14 @@
-"""n arms under one cerebellum, whatever is below it: what they observe, and how their actions become setpoints."""
+"""n arms, whatever is below them: what they observe, and how their actions become setpoints."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, without_jerk_limits
+from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene
-from bhd_lerobot.bodies.truth import ArmTruth
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.impedance import ImpedanceController
-from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
@@ -19,28 +16,8 @@ from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.host.host import Host
-
-if TYPE_CHECKING:  # it imports LeRobot, which the real-time process does without
-    from bhd_lerobot.robots.config_arm import ArmConfig
-
-TOOL_NAMES = (
-    "tool_x.pos",
-    "tool_y.pos",
-    "tool_z.pos",
-    "tool_qw.pos",
-    "tool_qx.pos",
-    "tool_qy.pos",
-    "tool_qz.pos",
-    "gripper.pos",
-)
-"""Position [m] and orientation (unit quaternion) of the tool frame in the base frame, and the gripper's opening [m]."""
-
-
-def tool_names(body: Body) -> tuple[str, ...]:
-    """Return the names of actions that are tool poses, with the gripper's opening if there is a gripper."""
-    return TOOL_NAMES if body.need(Arm).gripper else TOOL_NAMES[:-1]
-
+from bhd_lerobot.robots.parts.names import arm_action_names, arm_observation_names
+from bhd_lerobot.robots.parts.part import Ids, Part, Refused
 
 _SLACK = 0.2  # how far a policy's quaternion may be from unit length; it is normalised
 
@@ -72,30 +49,28 @@ _FAR = (
 )
 
 
-class ArmHost(Host):
+class ArmPart(Part):
     """n arms.
 
     Attributes:
-        plant: the joints.
         controller: an `ArmController`, or with ``control = "impedance"`` an `ImpedanceController`, whose compliance and
             feed-forward wrench may be set and whose estimate of the contact wrench may be read.
         kinematics: the arm's.
 
     Args:
         config: the robot.
-        plant: the joints.
+        body: its hardware.
+        plant: what moves the joints.
         planning: who plans goals; they are planned in the tick that they start in if None.
-        options: those of `Host`.
     """
 
-    knows: frozenset[str] | None = frozenset({"tool_pose", "opening"})
+    knows = frozenset({"tool_pose", "opening"})
 
-    def __init__(self, config: "ArmConfig", plant: Plant, planning: Planning | None = None, **options: Any) -> None:
-        body = config.body() if config.jerk_limits else without_jerk_limits(config.body())
+    def __init__(self, config: Any, body: Body, plant: Plant, planning: Planning | None = None) -> None:
         arm = body.need(Arm)
-        self.plant = plant
-        self.kinematics = ArmKinematics(arm.chain, arm.limits)
-        self._joints = len(arm.chain.joints)
+        self.config, self.kinematics = config, ArmKinematics(arm.chain, arm.limits)
+        self.action_names, self.observation_names = arm_action_names(config, body), arm_observation_names(config, body)
+        self._joints, self._values = len(arm.chain.joints), len(arm.limits.names)
         ticks = config.rates.ticks_per_frame
         self.controller: ArmController | ImpedanceController
         if config.control == "impedance":
@@ -120,22 +95,11 @@ class ArmHost(Host):
             self.controller.set_latency(np.arange(plant.n), plant.latency_s)
         self._taken = np.zeros((plant.n, 3))  # where the tool was to be by the last action that was not refused [m]
         self._refused = np.zeros(plant.n, np.bool_)  # the last action
-        super().__init__(
-            config,
-            Cerebellum(body, plant, config.control_hz, controller=self.controller),
-            action_names=tool_names(body) if config.action_space == "tool" else body.limits.names,
-            observation_names=observation_names(body, tool_pose=config.tool_pose),
-            **options,
-        )
 
-    def _newest(self) -> PlantReading:
-        """Return the newest reading of the joints."""
-        return self.cerebellum.reading
-
-    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
-        reading = self._newest()
-        return self._observed(np.concatenate([reading.position, reading.velocity], axis=1)), np.full(self.n, self.tick)
+    def sense(self, reading: PlantReading) -> NDArray[np.float64]:
+        """Return its observation's floats, shape (n, features)."""
+        values = self._values
+        return self._observed(np.concatenate([reading.position[:, :values], reading.velocity[:, :values]], axis=1))
 
     def _observed(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return observations of positions and speeds, shape (n, 2 joints): with the tool's pose if asked for."""
@@ -143,38 +107,37 @@ class ArmHost(Host):
             return state
         return np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : self._joints]))], axis=1)
 
-    def truth(self) -> ArmTruth:
+    def truth(self, reading: PlantReading) -> dict[str, Any]:
         """Return what the joints say: where the tools are. Of objects and touches nothing is known."""
-        position = self._newest().position
-        return ArmTruth(
-            tool_pose=pose_vectors(self.kinematics.tool(position[:, : self._joints])),
-            object_poses=np.zeros((self.n, MAX_OBJECTS, 7)),
-            opening=self._opening(position),
-            arm_on_table=np.zeros(self.n, np.bool_),
-            arm_on_object=np.zeros(self.n, np.bool_),
-            self_contact=np.zeros(self.n, np.bool_),
-            fingers_on_object=np.zeros((self.n, MAX_OBJECTS), np.bool_),
-        )
+        n, position = len(reading.position), reading.position
+        return {
+            "tool_pose": pose_vectors(self.kinematics.tool(position[:, : self._joints])),
+            "object_poses": np.zeros((n, MAX_OBJECTS, 7)),
+            "opening": self._opening(position),
+            "arm_on_table": np.zeros(n, np.bool_),
+            "arm_on_object": np.zeros(n, np.bool_),
+            "self_contact": np.zeros(n, np.bool_),
+            "fingers_on_object": np.zeros((n, MAX_OBJECTS), np.bool_),
+        }
 
     def _opening(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the openings of the grippers [m], shape (n,); 0 without one."""
-        return np.asarray(position[:, self._joints :].sum(axis=1))
+        return np.asarray(position[:, self._joints : self._values].sum(axis=1))
 
-    def reset(self, ids: NDArray[np.intp], scenes: Sequence[Any], seeds: Sequence[int]) -> NDArray[np.float64]:
-        """Start episodes."""
-        initial = super().reset(ids, scenes, seeds)
+    def begin(self, ids: Ids) -> None:
+        """Begin episodes."""
         self._refused[ids] = False
-        return initial
 
     def track(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pose of the tool in recorded observations, shape (frames, 7)."""
         return pose_vectors(self.kinematics.tool(np.asarray(states, np.float64)[:, : self._joints]))
 
-    def start_goal(self, scene: TableScene | None) -> BrainCommand | None:
+    def start_goal(self, scene: Any) -> BrainCommand | None:
         """Return the goal that brings an arm to the start of a scene; it stays where it is if there is none."""
         if scene is None or self.config.control == "impedance":
             return None
-        joints, opening = scene.posture[: self._joints], (*scene.posture[self._joints :], None)[0]
+        posture = table_of(scene, ()).posture
+        joints, opening = posture[: self._joints], (*posture[self._joints :], None)[0]
         return BrainCommand("start", joint_target=joints, gripper=opening, max_velocity=_TO_START, timeout_s=60.0)
 
     # --- tool space ---------------------------------------------------------------------------------------------------
@@ -187,8 +150,8 @@ class ArmHost(Host):
         return np.concatenate([tool, command[:, self._joints :]], axis=1)
 
     def to_setpoints(
-        self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64] | None = None
-    ) -> tuple[NDArray[np.float64], dict[int, tuple[Reason, str]]]:
+        self, action: NDArray[np.float64], mask: NDArray[np.bool_], before: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], Refused]:
         """Turn actions into setpoints, shape (n, width), and say which cannot be, and why.
 
         The posture of a tool pose is the one nearest to that before it. Near a singular posture, at the end of a
@@ -198,10 +161,10 @@ class ArmHost(Host):
         """
         if self.config.action_space == "joint":
             return action, {}
-        command, dof = self.cerebellum.command if before is None else before, self._joints
-        setpoints, refused = command.copy(), {}
+        dof = self._joints
+        setpoints, refused = before.copy(), {}
         for sim in np.flatnonzero(mask).tolist():
-            posture, problem = self._posture(sim, action[sim, :7], command[sim, :dof])
+            posture, problem = self._posture(sim, action[sim, :7], before[sim, :dof])
             if problem is None:
                 setpoints[sim] = (*posture, *action[sim, 7:])  # of an impedance the pose itself
                 self._taken[sim] = action[sim, :3]
@@ -226,7 +189,7 @@ class ArmHost(Host):
             return before, _JUMP.format(self.kinematics.chain.joints[int(turn.argmax())], turn.max(), _LARGEST_TURN)
         if self._refused[sim]:
             # In a fast stream the arm is far behind: a single refusal must not end it.
-            follows = self.cerebellum.mode[sim] == Mode.TRACKING
+            follows = self.host.cerebellum.mode[sim] == Mode.TRACKING
             places = [self.kinematics.tool(before)[:3, 3], *self._taken[sim : sim + follows]]
             step = min(float(np.linalg.norm(pose[:3] - place)) for place in places)
             if step > _LARGEST_STEP:
@@ -234,7 +197,7 @@ class ArmHost(Host):
         return posture, None
 
 
-def observation_names(body: Body, *, tool_pose: bool) -> tuple[str, ...]:
-    """Return the names of the observation's floats, in order."""
-    positions = body.limits.names
-    return (*positions, *(f"{name.removesuffix('.pos')}.vel" for name in positions), *TOOL_NAMES[:-1] * tool_pose)
+def table_of(scene: Any, home: tuple[float, ...]) -> TableScene:
+    """Return the tabletop of a scene, which is one, or has one; an empty one with the arm at home otherwise."""
+    table = getattr(scene, "table", scene)
+    return table if isinstance(table, TableScene) else TableScene("empty", (), home)
