@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lerobot.robots.config import RobotConfig
 
 import bhd_lerobot.robots.config_arm
+import bhd_lerobot.robots.config_mobile_arm
 import bhd_lerobot.robots.config_turtlebot3
 import bhd_lerobot.robots.config_ur5
 import bhd_lerobot.ros2.robots.config_robot
@@ -79,7 +80,7 @@ class _Blanked(BlankedBrain):
 
 _SIMULATION = "bhd_lerobot.robots.host.simulation:Simulation"
 ROBOTS: Registry[Any] = Registry(
-    "robot", dict.fromkeys(("arm", "so101", "turtlebot3", "ur5"), _SIMULATION), RobotConfig
+    "robot", dict.fromkeys(("arm", "so101", "turtlebot3", "turtlebot3_manipulation", "ur5"), _SIMULATION), RobotConfig
 )
 """The classes of the robots' simulations, by type; those of this package import MuJoCo."""
 
