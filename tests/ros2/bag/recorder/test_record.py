@@ -284,7 +284,9 @@ def test_where_nothing_can_be_written_any_more_what_was_written_can_be_read(stor
     assert "What was recorded before can be read." in said
     numbers = [int(one.data[:6]) for _, one in by_rosbags(bag)["/a"]]
     assert len(numbers) > 50
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    whole = list(range(numbers[0], numbers[0] + len(numbers)))
+    # Where it gets no processor time, more waits than DDS keeps: that is said.
+    assert numbers == whole or (numbers == sorted(set(numbers)) and "some may be lost" in said)
 
 
 OWN = "own_msgs/msg/Own"
