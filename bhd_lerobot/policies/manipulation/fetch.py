@@ -95,7 +95,10 @@ class FetchBrain(GoalBrain):
         self._navigator.bind(replace(robot, environment_names=GOAL))
         arm, self._gripper, name = robot.need(Arm), robot.need(GripperSpec), self.name
         self._home, chain = np.array(arm.home), arm.chain
-        self._environment = find_columns(robot.environment_names, (*_OBJECT, *_ENDS), name, "environment")
+        names = (*_OBJECT, *_ENDS)
+        self._environment = find_columns(robot.environment_names, names, name, "environment")
+        self._positions = [names.index(f"{what}_{axis}") for what in ("object_0", "place") for axis in "xyz"]
+        self._error = np.tile(self.config.camera_error_m, 2)
         self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], name, "observation")[0])
         self._held = find_columns(robot.action_names, arm.limits.names, name, "action")
         self._driven = find_columns(robot.action_names, robot.need(Drive).limits.names, name, "action")
@@ -150,6 +153,7 @@ class FetchBrain(GoalBrain):
     def _look(self, sim: int, seen: Observation, result: CommandResult | None) -> _View:
         assert seen.environment_state is not None
         row = seen.environment_state[sim, self._environment]
+        row[self._positions] -= self._error
         found = read_objects(row[None, : len(_OBJECT)])
         if not found:  # where it was last
             return self._views[sim]._replace(result=result)
