@@ -13,7 +13,6 @@ from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.parts.arm import ArmPart, table_of
-from bhd_lerobot.robots.parts.drive import arena_of
 from bhd_lerobot.robots.parts.latency import LatePlant
 from bhd_lerobot.robots.parts.part import Ids, SimulatedPart
 from bhd_lerobot.sim.tabletop import Tabletop
@@ -35,7 +34,7 @@ class SimulatedArm(ArmPart, SimulatedPart):
     def __init__(self, config: Any, body: Body, plant: LatePlant, world: World, planning: Planning | None) -> None:
         super().__init__(config, body, plant, planning)
         self._world, self._plant, self.table = world, plant, Tabletop(world)
-        self._noise, self._is_mobile = np.zeros(world.n), body.drive is not None
+        self._noise = np.zeros(world.n)
 
     def place(self, ids: Ids, scenes: Sequence[Any]) -> None:
         """Put the arms and their objects where the scenes want them, at rest."""
@@ -46,8 +45,7 @@ class SimulatedArm(ArmPart, SimulatedPart):
                 f"latency_s is {max(latency)}; with robot.control = impedance the torque loop is stable with at most "
                 f"{_MAX_TORQUE_LATENCY} s."
             )
-        starts = np.array([arena_of(scene).start for scene in scenes]) if self._is_mobile else None
-        self.table.place(tables, ids, starts)
+        self.table.place(tables, ids)
         self._noise[ids] = [table.variation.sensor_noise for table in tables]
         self._plant.set_latency(ids, [round(late * self.config.control_hz) for late in latency])
         if isinstance(self.controller, ArmController):
