@@ -130,7 +130,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "apps.view": ("tasks", "bodies", "control", "control.geometry", *_DATASETS, "datasets.assembly", "datasets.edit"),
     "apps.monitor": ("control", "control.motion", "realtime", "datasets.format", "apps.view"),
     "apps.doctor": (
-        *("options", "versions", "tasks", "policies", "bodies", "sim", "realtime", "datasets.format"),
+        *("options", "versions", "tasks", "policies", "bodies", "control", "sim", "realtime", "datasets.format"),
         "control.geometry",
     ),
     "api": (

@@ -34,6 +34,7 @@ class ArmFile:
         home: posture that it starts in [rad]; the file's keyframe ``home``, or one in the middle of what it reaches, if
             empty.
         ranges: lowest and highest position [rad] of joints by name, in place of the file's.
+        servos: stiffness [N m/rad], damping [N m s/rad] and friction [N m] of joints by name, in place of the file's.
         velocity: largest speed of each joint, or of all of them [rad/s]; that of a URDF, or 2 if empty.
         acceleration: largest acceleration, likewise [rad/s^2]; what the motors can give in any posture if empty.
         effort: largest torque, likewise [N m]; the file's if empty.
@@ -47,6 +48,7 @@ class ArmFile:
     gripper: GripperFile = GripperFile()
     home: tuple[float, ...] = ()
     ranges: tuple[tuple[str, float, float], ...] = ()
+    servos: tuple[tuple[str, float, float, float], ...] = ()
     velocity: tuple[float, ...] = ()
     acceleration: tuple[float, ...] = ()
     effort: tuple[float, ...] = ()

@@ -16,7 +16,8 @@ def _parser() -> Parser:
     parser = Parser(
         prog="bhd-doctor",
         description="Check this machine; print symptom, cause and remedy of each problem. Exit status 1: a problem. "
-        "With --robot.type=… and its other options: print what is understood of an arm, and write --picture=FILE.",
+        "With --robot.type=… and its other options: print what is understood of an arm, and write --picture=FILE; with "
+        "--identify: move its joints a little about home, and print the servos that it has.",
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument("--root", type=Path, help="folder for datasets, whose disk is checked; LeRobot's by default")
@@ -36,6 +37,7 @@ def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) ->
     """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
     given = sys.argv[1:] if arguments is None else arguments
     if any(one.startswith("--robot.") for one in given):
+        given = ["--identify=true" if one == "--identify" else one for one in given]
         import bhd_lerobot.registry  # noqa: F401  registers the robots
         from bhd_lerobot.apps.doctor.robot import RobotDescription, describe_robot
 

@@ -1,6 +1,5 @@
 """What the configurations of all simulated robots have in common."""
 
-import pickle
 from abc import abstractmethod
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar
@@ -20,8 +19,6 @@ _ROS2_PLANTS = {
     True: "bhd_lerobot.ros2.robots.base_plant:BasePlant",
     False: "bhd_lerobot.ros2.robots.arm_plant:ArmPlant",
 }
-_DEVICE_PLANT = "bhd_lerobot.robots.device.plant:DevicePlant"
-_DEVICE_TIMEOUT_S = 0.1  # a serial bus repeats what was lost
 
 
 @dataclass(kw_only=True)
@@ -35,13 +32,9 @@ class BhdRobotConfig(RobotConfig):
         require_realtime: with ``clock = "realtime"``, refuse to start if the system does not grant SCHED_FIFO.
         realtime: how it runs on the wall clock.
         plant: what is driven in place of a simulated robot: ``"ros2"``, a robot of this type on a ROS 2 network;
-            ``"lerobot"``, an arm that LeRobot drives, see `device`; or a class of any package,
+            ``"lerobot"``, an arm that LeRobot drives, `device`; or a class of any package,
             ``"package.module:Class"``, see "Write a plant for your robot", which needs `clock = "realtime"`.
         ros2: the network of ``plant = "ros2"``.
-        device: the robot of ``plant = "lerobot"``, with LeRobot's own options: any that observes and takes positions.
-        units: what its readings mean, by joint: ``deg``, ``rad``, or two readings with the positions [rad, m] that they
-            mean, ``[[0, 0.0], [100, 1.57]]``; with ``{from: NAME, is: …}`` those of another feature. Degrees and
-            ±100 of a calibrated bus are known, and the jaw of an SO-101.
         jerk_limits: let accelerations change gradually when setpoints are followed. Off, they change at once.
         control_hz: cerebellum ticks a second [Hz], a multiple of fps.
         physics_hz: physics steps a second [Hz], a multiple of control_hz.
@@ -54,7 +47,6 @@ class BhdRobotConfig(RobotConfig):
     """
 
     not_recorded: ClassVar[tuple[str, ...]] = ()
-    usual_units: ClassVar[dict[str, Any]] = {}
 
     fps: int
     clock: Annotated[str, OneOf(CLOCKS)] = "lockstep"
@@ -62,8 +54,6 @@ class BhdRobotConfig(RobotConfig):
     realtime: RealtimeConfig = field(default_factory=RealtimeConfig)
     plant: str = ""
     ros2: Ros2Config = field(default_factory=Ros2Config)
-    device: RobotConfig | None = None
-    units: dict[str, Any] = field(default_factory=dict)
     jerk_limits: bool = True
     control_hz: int
     physics_hz: int
@@ -83,11 +73,6 @@ class BhdRobotConfig(RobotConfig):
             brain_s = self.realtime.brain_timeout_s
             brain_s = self.ros2.timeout_s if brain_s is None else brain_s
             self.realtime = replace(self.realtime, plant_timeout_s=timeout_s, brain_timeout_s=brain_s)
-        if self.plant == "lerobot":
-            self.plant, self.clock = _DEVICE_PLANT, "realtime"
-            timeout_s = max(self.realtime.plant_timeout_s, _DEVICE_TIMEOUT_S)
-            self.realtime = replace(self.realtime, plant_timeout_s=timeout_s)
-        self._check_device()
         if self.plant:
             self._check_plant()
         elif given := [
@@ -97,43 +82,11 @@ class BhdRobotConfig(RobotConfig):
                 f"robot.ros2.{given[0]} is of a robot on a network; add --robot.plant=ros2 or leave it out."
             )
 
-    def _check_device(self) -> None:
-        if self.plant != _DEVICE_PLANT:
-            if self.device is not None or self.units:
-                name = "units" if self.device is None else "device"
-                raise ConfigError(f"robot.{name} is of plant=lerobot; add --robot.plant=lerobot or leave it out.")
-        elif self.device is None:
-            raise ConfigError(
-                "robot.plant is 'lerobot', and robot.device is not set: say which robot of LeRobot it is, for example "
-                "--robot.device.type=so101_follower --robot.device.port=/dev/ttyACM0 --robot.device.id=arm."
-            )
-        elif isinstance(self.device, BhdRobotConfig):
-            raise ConfigError(
-                f"robot.device.type is {self.device.type!r}, a robot of this package; name one that LeRobot drives."
-            )
-        elif self.body().arm is None:
-            raise ConfigError(f"robot.plant is 'lerobot', and {self.type} is no arm: choose one with --robot.type.")
-
-    @property
-    def notes(self) -> list[str]:
-        """What the plant of another package does not tell, for whoever starts it."""
-        if self.device is None:
-            return []
-        return [
-            f"{self.device.type} tells positions only: speeds are the slopes of its last readings, efforts are not "
-            "known, so robot.max_force limits nothing. Commands make up for the arm's weight, not for what it holds."
-        ]
-
-    def plant_values(self) -> dict[str, Any]:
-        """Return what a plant in another process, without a class of LeRobot, needs besides plain options."""
-        if self.device is None:
-            return {}
-        return {"device": pickle.dumps(self.device), "units": {**self.usual_units, **self.units}}
-
     def _check_plant(self) -> None:
         module, sign, name = self.plant.partition(":")
         if not (sign and name.isidentifier() and all(part.isidentifier() for part in module.split("."))):
-            raise ConfigError(f"robot.plant is {self.plant!r}; name a class as package.module:Class, ros2 or lerobot.")
+            names = "name a class as package.module:Class; or ros2, or for an arm lerobot"
+            raise ConfigError(f"robot.plant is {self.plant!r}; {names}.")
         if self.clock != "realtime":
             raise ConfigError("robot.plant names a robot that goes on by itself: use --robot.clock=realtime with it.")
         if self.camera:

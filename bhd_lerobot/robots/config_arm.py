@@ -1,7 +1,8 @@
 """Configurations of simulated arms."""
 
+import pickle
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -15,6 +16,9 @@ from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
 from bhd_lerobot.robots.config import BhdRobotConfig
+
+_DEVICE_PLANT = "bhd_lerobot.robots.device.plant:DevicePlant"
+_DEVICE_TIMEOUT_S = 0.1  # a serial bus repeats what was lost
 
 
 @dataclass(kw_only=True)
@@ -42,8 +46,16 @@ class ArmConfig(BhdRobotConfig):
             x, y, z of the other, and the radius, in the base frame [m]. Goals and setpoints keep away from them.
         wrench: record what the surroundings put on the tool as well, force and moment as estimated from the motors'
             efforts: `control.wrench`.
+        device: the robot of ``plant = "lerobot"``, with LeRobot's own options: any that observes and takes positions.
+        units: what its readings mean, by joint: ``deg``, ``rad``, or two readings with the positions [rad, m] that they
+            mean, ``[[0, 0.0], [100, 1.57]]``; with ``{from: NAME, is: …}`` those of another feature. Degrees and
+            ±100 of a calibrated bus are known, and the jaw of an SO-101.
+        servos: of an arm from a file, stiffness [N m/rad], damping [N m s/rad] and friction [N m] of joints by name, in
+            place of the file's: what `bhd-doctor` finds out with ``--identify``.
         stale_after_s: time after the end of the frame that a setpoint was for, until the arm decelerates and holds [s].
     """
+
+    usual_units: ClassVar[dict[str, Any]] = {}
 
     fps: int = 25
     control_hz: int = 500
@@ -57,9 +69,17 @@ class ArmConfig(BhdRobotConfig):
     held_clearance: bool = True
     obstacles: list[list[float]] = field(default_factory=list)
     wrench: bool = False
+    device: RobotConfig | None = None
+    units: dict[str, Any] = field(default_factory=dict)
+    servos: dict[str, list[float]] = field(default_factory=dict)
     stale_after_s: Positive = 0.1
 
     def __post_init__(self) -> None:
+        if self.plant == "lerobot":
+            self.plant, self.clock = _DEVICE_PLANT, "realtime"
+            timeout_s = max(self.realtime.plant_timeout_s, _DEVICE_TIMEOUT_S)
+            self.realtime = replace(self.realtime, plant_timeout_s=timeout_s)
+        self._check_device()
         super().__post_init__()
         if self.control == "impedance" and self.action_space != "tool":
             raise ConfigError(
@@ -73,6 +93,41 @@ class ArmConfig(BhdRobotConfig):
                     "one end, x, y, z of the other, and the radius, which is positive."
                 )
         self.check_rates()
+
+    def _check_device(self) -> None:
+        if self.plant != _DEVICE_PLANT:
+            if self.device is not None or self.units:
+                name = "units" if self.device is None else "device"
+                raise ConfigError(f"robot.{name} is of plant=lerobot; add --robot.plant=lerobot or leave it out.")
+        elif self.device is None:
+            raise ConfigError(
+                "robot.plant is 'lerobot', and robot.device is not set: say which robot of LeRobot it is, for example "
+                "--robot.device.type=so101_follower --robot.device.port=/dev/ttyACM0 --robot.device.id=arm."
+            )
+        elif isinstance(self.device, BhdRobotConfig):
+            raise ConfigError(
+                f"robot.device.type is {self.device.type!r}, a robot of this package; name one that LeRobot drives."
+            )
+        elif self.control != "servo":
+            raise ConfigError(
+                f"robot.control is {self.control!r}, and robot.device takes positions: use --robot.control=servo."
+            )
+
+    @property
+    def notes(self) -> list[str]:
+        """What a device does not tell, for whoever starts it."""
+        if self.device is None:
+            return []
+        return [
+            f"{self.device.type} tells positions only: speeds are the slopes of its last readings, efforts are not "
+            "known, so robot.max_force limits nothing. Commands make up for the arm's weight, not for what it holds."
+        ]
+
+    def plant_values(self) -> dict[str, Any]:
+        """Return what the plant in another process, without a class of LeRobot, needs besides plain options."""
+        if self.device is None:
+            return {}
+        return {"device": pickle.dumps(self.device), "units": {**self.usual_units, **self.units}}
 
     @property
     def capsules(self) -> list[Capsule]:
@@ -121,6 +176,20 @@ class GripperOptions:
 class ModelArmConfig(ArmConfig):
     """Options of arms whose model is a file. A subclass says which, in `file`."""
 
+    def __post_init__(self) -> None:
+        for name, values in self.servos.items():
+            if len(values) != 3 or not np.isfinite(values).all() or not values[0] > 0 or min(values) < 0:
+                raise ConfigError(
+                    f"robot.servos has {values} for {name!r}; it needs stiffness, which is positive, damping and "
+                    "friction, which are not negative."
+                )
+        super().__post_init__()
+
+    @property
+    def measured(self) -> tuple[tuple[str, float, float, float], ...]:
+        """The servos that were measured, as `ArmFile` takes them."""
+        return tuple((name, values[0], values[1], values[2]) for name, values in self.servos.items())
+
     @property
     @abstractmethod
     def file(self) -> ArmFile:
@@ -157,7 +226,7 @@ class SO101Config(ModelArmConfig):
     @property
     def file(self) -> ArmFile:
         """The file, and what it does not say."""
-        return SO101
+        return replace(SO101, servos=self.measured)
 
 
 @RobotConfig.register_subclass("arm")
@@ -222,6 +291,7 @@ class FileArmConfig(ModelArmConfig):
             gripper=GripperFile(**vars(self.gripper)),
             home=tuple(self.home),
             ranges=tuple((name, low, high) for name, (low, high) in self.ranges.items()),
+            servos=self.measured,
             velocity=tuple(self.velocity),
             acceleration=tuple(self.acceleration),
             effort=tuple(self.effort),

@@ -1,3 +1,3 @@
 """`bhd-doctor`: what this machine lacks, and the remedy."""
 
-__all__ = ["checks", "doctor", "following", "latency_test", "robot", "trials"]
+__all__ = ["checks", "doctor", "following", "identify", "latency_test", "robot", "trials"]

@@ -10,10 +10,12 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from bhd_lerobot.apps.doctor.identify import excite, for_identification, identify, servo_option, servo_table
 from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.control.geometry.capsules import left_out
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.errors import ConfigError, RenderingError
+from bhd_lerobot.stock import make_robot_from_config
 
 _SIZE = 640, 480  # [px] of the picture
 
@@ -25,10 +27,12 @@ class RobotDescription:
     Attributes:
         robot: the arm.
         picture: where a picture of it is written.
+        identify: move its joints a little about home, and print the servos that it has; nothing else.
     """
 
     robot: RobotConfig
     picture: Path = Path("robot.png")
+    identify: bool = False
 
 
 def describe_robot(config: RobotDescription, console: Console) -> None:
@@ -41,6 +45,9 @@ def describe_robot(config: RobotDescription, console: Console) -> None:
     made: Any = config.robot
     if not hasattr(made, "body") or (body := made.body()).arm is None:
         raise ConfigError(f"robot.type is {made.type!r}; bhd-doctor describes arms: arm, so101, ur5.")
+    if config.identify:
+        _identify(made, console)
+        return
     arm = body.need(Arm)
     console.print(_joints(arm))
     for name, text in _facts(body, arm).items():
@@ -51,6 +58,19 @@ def describe_robot(config: RobotDescription, console: Console) -> None:
         console.print(f"{'picture:':<16}none: {error}", highlight=False, soft_wrap=True)
     else:
         console.print(f"{'picture:':<16}{config.picture}", highlight=False, soft_wrap=True)
+
+
+def _identify(config: Any, console: Console) -> None:
+    """Connect an arm, move it, and print the servos that it has."""
+    robot: Any = make_robot_from_config(for_identification(config))
+    robot.connect()
+    try:
+        with console.status("Moving each joint by 0.1 rad about home …"):
+            found = {track.joint: identify(robot.body, track) for track in list(excite(robot.host))}
+    finally:
+        robot.disconnect()
+    console.print(servo_table(robot.body, found))
+    console.print(servo_option(robot.body, found), highlight=False, soft_wrap=True)
 
 
 def _joints(arm: Arm) -> Table:

@@ -444,7 +444,7 @@ def _columns(parts: Sequence[Part]) -> tuple[list[slice], list[slice]]:
     return actions, commands
 
 
-LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor")
+LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor", "servos")
 """Options that `describe` does not mention where they are off, as in the data of versions that did not have them."""
 
 

@@ -133,6 +133,8 @@ class _Arm(RobotFile):
             elif joint.name in self.names:
                 number = self.names.index(joint.name)
                 joint.damping = 0.0 if np.isscalar(joint.damping) else [0.0] * len(joint.damping)
+                if self.file.servos:
+                    joint.frictionloss = self.servos[number].friction
                 joint.range, joint.limited = [self.lower[number], self.upper[number]], True
                 if not joint.armature and not self.servos[number].stiffness:
                     joint.armature = _ROTOR * self.servos[number].effort

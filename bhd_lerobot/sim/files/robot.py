@@ -202,6 +202,12 @@ class RobotFile:
         damping = float(self.model.dof_damping[self.model.jnt_dofadr[joint]])
         friction = float(self.model.dof_frictionloss[self.model.jnt_dofadr[joint]])
         stiffness, own = gains or (0.0, 0.0)
+        measured = {one: values for one, *values in self.file.servos}
+        if unknown := measured.keys() - set(self.names):
+            raise ConfigError(unknown_name("joint of robot.servos", min(unknown), self.names))
+        if name in measured:
+            stiffness, own, friction = measured[name]
+            return Servo(stiffness, own, effort, friction)
         return Servo(stiffness, own + damping, effort, friction)
 
     def _effort(self, number: int, actuators: Sequence[int]) -> float:

@@ -21,16 +21,19 @@ START = (0.1, -1.0, 0.6, 1.2, -0.5, 0.3)  # [rad]
 class Bus:
     """The file that stands for a port, and the calibration of what is on it."""
 
-    def __init__(self, folder: Path, **about: Any) -> None:
+    def __init__(self, folder: Path) -> None:
         self.port, self.calibration = folder / "bus", folder / "calibration"
-        self.port.write_text(json.dumps({"start": START, **about}))
+        self.change()
         self.calibration.mkdir()
-        offsets = about.get("offset", [0] * 6)
         motors = {}
         for number, (name, ends) in enumerate(zip(JOINTS, RANGES, strict=True)):
-            low, high = (0, 4095) if ends[0] is None else (2048 + offsets[number] + round(end * STEPS) for end in ends)
+            low, high = (0, 4095) if ends[0] is None else (2048 + round(end * STEPS) for end in ends)
             motors[name] = {"id": number + 1, "drive_mode": 0, "homing_offset": 0, "range_min": low, "range_max": high}
         (self.calibration / "arm.json").write_text(json.dumps(motors))
+
+    def change(self, **about: Any) -> None:
+        """State what the arm on the bus is, see the double."""
+        self.port.write_text(json.dumps({"start": START, **about}))
 
     @property
     def fault(self) -> Path:

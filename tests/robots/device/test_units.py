@@ -10,6 +10,7 @@ from lerobot.robots.so_follower import SO101FollowerConfig
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
+from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.device.process import Speed
 from bhd_lerobot.robots.device.units import Motor, unit_of
 from tests.cases import each_case
@@ -69,7 +70,14 @@ def test_what_means_nothing_is_refused(row: Any, motor: Motor, text: str) -> Non
         (lambda: SO101Config(device=DEVICE), "robot.device is of plant=lerobot; add --robot.plant=lerobot"),
         (lambda: SO101Config(units={"gripper": "deg"}), "robot.units is of plant=lerobot"),
         (lambda: SO101Config(plant="lerobot", device=SO101Config()), "'so101', a robot of this package"),
-        (lambda: TurtleBot3Config(plant="lerobot", device=DEVICE), "turtlebot3 is no arm"),
+        (
+            lambda: TurtleBot3Config(plant="lerobot"),
+            "name a class as package.module:Class; or ros2",
+        ),
+        (
+            lambda: UR5Config(plant="lerobot", device=DEVICE, control="impedance", action_space="tool"),
+            "robot.device takes positions: use --robot.control=servo",
+        ),
     ],
 )
 def test_options_that_fit_nothing_are_refused(make: Any, text: str) -> None:

@@ -1,8 +1,8 @@
 """Feetech's SDK as LeRobot calls it, with a simulated SO-101 on the bus: everything above the packets is LeRobot's own.
 
-The port is a JSON file: `servo`, gains and friction in place of the model's; `start`, the joints [rad]; `offset`, by
-how much the encoders' zeros are off [steps]. While a file `PORT.fault` exists the bus answers nothing. Each goal is
-appended to `PORT.log`, and `PORT.torque` holds whether the motors are on.
+The port is a JSON file: `servo`, gains and friction in place of the model's; `start`, the joints [rad]. While a file
+`PORT.fault` exists the bus answers nothing. Each goal is appended to `PORT.log`, and `PORT.torque` holds whether the
+motors are on.
 """
 
 import json
@@ -53,11 +53,9 @@ class Arm:
         self.data.ctrl[:] = self.data.qpos
         self.registers: dict[tuple[int, int], int] = {}
         for k, (low, high) in enumerate(model.jnt_range.tolist()):
-            offset = about.get("offset", [0] * 6)[k]
-            ends = (2048 + offset + round(low * STEPS), 2048 + offset + round(high * STEPS))
+            ends = (2048 + round(low * STEPS), 2048 + round(high * STEPS))
             self.registers[k + 1, 9], self.registers[k + 1, 11] = ends if k != 4 else (0, 4095)  # it turns right round
             self.registers[k + 1, TORQUE] = 0
-        self.zero = [2048 + offset for offset in about.get("offset", [0] * 6)]
         self.since = time.monotonic()
 
     def run(self) -> None:
@@ -71,7 +69,7 @@ class Arm:
 
     def read(self, motor: int, address: int) -> int:
         if address == PRESENT:
-            return self.zero[motor - 1] + round(float(self.data.qpos[motor - 1]) * STEPS)
+            return 2048 + round(float(self.data.qpos[motor - 1]) * STEPS)
         return MODEL.get(address, self.registers.get((motor, address), 0))
 
     def write(self, motor: int, address: int, value: int) -> None:
@@ -80,7 +78,7 @@ class Arm:
             Path(f"{self.port}.torque").write_text(str(value))
         if address == GOAL:
             value = min(max(value, self.registers[motor, 9]), self.registers[motor, 11])
-            self.data.ctrl[motor - 1] = (value - self.zero[motor - 1]) / STEPS
+            self.data.ctrl[motor - 1] = (value - 2048) / STEPS
 
     @property
     def is_silent(self) -> bool:
