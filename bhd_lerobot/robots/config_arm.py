@@ -112,6 +112,10 @@ class ArmConfig(BhdRobotConfig):
             raise ConfigError(
                 f"robot.control is {self.control!r}, and robot.device takes positions: use --robot.control=servo."
             )
+        elif self.body().drive is not None:
+            raise ConfigError(f"robot.plant is 'lerobot', and {self.type} has wheels, too: choose an arm alone.")
+        if self.servos and not isinstance(self, ModelArmConfig):
+            raise ConfigError(f"robot.servos is of arms from a file, and those of {self.type} are known: leave it out.")
 
     @property
     def notes(self) -> list[str]:

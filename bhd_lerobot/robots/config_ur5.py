@@ -6,7 +6,6 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.ur5 import ur5
-from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_arm import ArmConfig
 
 
@@ -17,8 +16,6 @@ class UR5Config(ArmConfig):
 
     def body(self) -> Body:
         """Return the hardware that this configuration describes."""
-        if self.servos:
-            raise ConfigError("robot.servos is of arms from a file; the servos of a UR5 are known. Leave it out.")
         return ur5(
             load=self.payload,
             obstacles=self.capsules,

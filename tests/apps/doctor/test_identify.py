@@ -81,7 +81,7 @@ def test_servos_that_cannot_be_are_refused(servos: dict[str, list[float]], text:
 
 
 def test_the_servos_of_a_ur5_are_known() -> None:
-    with pytest.raises(ConfigError, match="servos of a UR5 are known"):
+    with pytest.raises(ConfigError, match="those of ur5 are known"):
         UR5Config(servos={"elbow": [1.0, 1.0, 0.0]})
 
 

@@ -9,6 +9,7 @@ from lerobot.robots.so_follower import SO101FollowerConfig
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_arm import SO101Config
+from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.device.process import Speed
@@ -78,6 +79,7 @@ def test_what_means_nothing_is_refused(row: Any, motor: Motor, text: str) -> Non
             lambda: UR5Config(plant="lerobot", device=DEVICE, control="impedance", action_space="tool"),
             "robot.device takes positions: use --robot.control=servo",
         ),
+        (lambda: TurtleBot3ManipulationConfig(plant="lerobot", device=DEVICE), "turtlebot3_manipulation has wheels"),
     ],
 )
 def test_options_that_fit_nothing_are_refused(make: Any, text: str) -> None:
