@@ -77,11 +77,10 @@ class SimulatedDrive(DrivePart, SimulatedPart):
             self._scan(np.array([sim]))
 
     def place(self, ids: Ids, scenes: Sequence[Any]) -> None:
-        """Put robots into arenas, at rest at their start; what has an arm is put there with it."""
+        """Put robots into arenas, at rest at their start."""
         arenas = [arena_of(scene) for scene in scenes]
         self._world.place([arena.shapes for arena in arenas], ids)
-        if self.first == 0:
-            self._world.reset(ids, np.array([arena.start for arena in arenas]))
+        self._world.reset(ids, np.array([arena.start for arena in arenas]))
 
     def started(self, ids: Ids) -> None:
         """Take a first scan."""
