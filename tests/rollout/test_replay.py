@@ -133,6 +133,16 @@ def test_an_episode_of_setpoints_and_goals_as_version_0_3_recorded_it_is_repeate
     assert Replay(root, 0).open_loop().identical
 
 
+def test_an_episode_of_setpoints_and_goals_is_repeated(tmp_path):
+    fetch = {"robot__type": "turtlebot3_manipulation", "task__type": "fetch", "brain__type": "fetch"}
+    run_record(tmp_path / "d", **fetch, task__duration_s=20.0, dataset__num_episodes=1)
+    replay = Replay(tmp_path / "d", 0)
+    spans = json.loads(replay.metadata["goal_frames"])
+    assert 0 < sum(end - first for first, end in spans) < len(replay.columns["action"])
+    assert replay.open_loop().identical
+    assert replay.state_exact().identical
+
+
 def test_other_versions_are_named(recorded):
     replay = Replay(recorded, 0)
     assert replay.changed_versions() == {}
