@@ -135,7 +135,7 @@ def test_an_episode_of_setpoints_and_goals_as_version_0_3_recorded_it_is_repeate
 
 def test_an_episode_of_setpoints_and_goals_is_repeated(tmp_path):
     fetch = {"robot__type": "turtlebot3_manipulation", "task__type": "fetch", "brain__type": "fetch"}
-    run_record(tmp_path / "d", **fetch, task__duration_s=20.0, dataset__num_episodes=1)
+    run_record(tmp_path / "d", **fetch, robot__beams=120, dataset__episode_time_s=20.0, dataset__num_episodes=1)
     replay = Replay(tmp_path / "d", 0)
     spans = json.loads(replay.metadata["goal_frames"])
     assert 0 < sum(end - first for first, end in spans) < len(replay.columns["action"])
