@@ -5,6 +5,7 @@ packages add theirs with `register_robot`, `register_task`, `register_brain` and
 """
 
 from collections.abc import Callable, Set
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lerobot.robots.config import RobotConfig
@@ -83,6 +84,15 @@ ROBOTS: Registry[Any] = Registry(
     "robot", dict.fromkeys(("arm", "so101", "turtlebot3", "turtlebot3_manipulation", "ur5"), _SIMULATION), RobotConfig
 )
 """The classes of the robots' simulations, by type; those of this package import MuJoCo."""
+
+
+def _body_of(robot_type: str) -> Body:
+    body: Body = RobotConfig.get_choice_class(robot_type)().body()  # type: ignore[attr-defined]
+    return body
+
+
+for _type in ROBOTS.keys() - BODIES.keys():
+    BODIES.register(_type, partial(_body_of, _type))
 
 _CLASSES: tuple[Any, ...] = (
     *(AvoidanceBrain, _Blanked, _Dagger, FetchBrain, GapFollowerBrain, LanguageBrain, LearnedBrain, NavigatorBrain),

@@ -35,7 +35,6 @@ OF_OWN_BODIES = {
         "robots.config_mobile_arm",
         "robots.config_turtlebot3",
         "robots.config_ur5",
-        "sim.files.arm",
     ),
     *("ros2.messages.presets", "cli.data.import_bag"),
     *("teleoperators.config_bhd_keyboard_base", "policies.cnn.configuration_cnn"),

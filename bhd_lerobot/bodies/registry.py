@@ -9,11 +9,10 @@ from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.options.plugins import load_plugins
 from bhd_lerobot.options.registry import Registry
 
-_OWN: dict[str, Callable[[], Body] | str] = {
+_OWN: dict[str, Callable[[], Body] | str] = {  # those of files are added by `bhd_lerobot.registry`
     "turtlebot3": turtlebot3_burger,
     "ur5": ur5,
     "arm": ur5,  # stands for the arms that are files
-    "so101": "bhd_lerobot.sim.files.arm:so101",
     "turtlebot3_manipulation": turtlebot3_manipulation,
 }
 OF_FILES = ("arm", "so101")

@@ -28,7 +28,6 @@ from bhd_lerobot.bodies.body import (
     Limits,
     Workspace,
 )
-from bhd_lerobot.bodies.so101 import SO101
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -91,11 +90,6 @@ def arm_body(
     limits = replace(arm.limits, command_timeout_s=command_timeout_s)
     cameras = {name: CameraSpec(name, camera_width, camera_height) for name in body.cameras}
     return replace(body, arm=replace(arm, chain=chain, limits=limits, load=load), cameras=cameras)
-
-
-def so101() -> Body:
-    """Return the SO-101 with the options that it has by default."""
-    return arm_body(SO101)
 
 
 class _Arm(RobotFile):

@@ -14,7 +14,6 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.arm import SO101
 from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.sim.files.arm import so101
 from tests.cases import each_case
 from tests.robots.device.support import Bus
 from tests.robots.device.support import bus as bus  # noqa: PLC0414
@@ -59,7 +58,7 @@ def test_an_arm_on_its_bus_is_found_within_ten_percent(bus: Bus) -> None:
 
 def test_what_is_printed_is_the_option_of_the_same_arm() -> None:
     found = {k: ServoModel(10.0 + k, 0.5, 0.02, 0.0, 0.0) for k in range(5)}
-    name, _, text = servo_option(so101(), found).partition("=")
+    name, _, text = servo_option(SO101Config().body(), found).partition("=")
     assert name == "--robot.servos"
     arm = SO101Config(servos=yaml.safe_load(text.strip("'"))).body().need(Arm)
     assert arm.servo_stiffness[:5] == (10.0, 11.0, 12.0, 13.0, 14.0)

@@ -12,8 +12,8 @@ from bhd_lerobot.control.geometry.kinematics import ArmKinematics, IkResult
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan, PlanFailure
 from bhd_lerobot.control.motion.trajectory import State
+from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.sim.chain import chain_from_mjcf
-from bhd_lerobot.sim.files.arm import so101
 from tests.cases import each_case
 from tests.control.geometry.arm_models import serial
 from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
@@ -329,6 +329,6 @@ def test_a_line_whose_faster_law_would_stand_still_follows_the_even_one() -> Non
     command = BrainCommand("a", target_pose=Pose((x, y, z), tuple(quaternion)), motion="line", max_velocity=0.25)
     command = dataclasses.replace(command, max_acceleration=1.0)
     rest = np.zeros(6)
-    answer = GoalPlanner(so101(), HZ).plan(command, np.array([*start, 0.05]), rest, rest)
+    answer = GoalPlanner(SO101Config().body(), HZ).plan(command, np.array([*start, 0.05]), rest, rest)
     assert isinstance(answer, Plan), answer
     assert answer.trajectory.ticks < 10 * HZ

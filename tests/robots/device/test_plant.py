@@ -24,7 +24,6 @@ from bhd_lerobot.recording.record import record
 from bhd_lerobot.robots.arm import SO101
 from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.device.plant import DevicePlant
-from bhd_lerobot.sim.files.arm import so101
 from tests.robots.device.support import JOINTS, START, STEPS, Bus
 from tests.robots.device.support import bus as bus  # noqa: PLC0414
 from tests.robots.external.mock_devices import MockArmConfig
@@ -36,7 +35,7 @@ def refusal(device: Any, **units: Any) -> str:
     """Return why a device cannot be the plant of an SO-101."""
     options = SO101Config(plant="lerobot", device=device, units=units)
     config = SimpleNamespace(**options.plant_values(), rates=options.rates)
-    plant = DevicePlant(config, so101())
+    plant = DevicePlant(config, options.body())
     try:
         plant.open()
         plant.enable()
@@ -81,12 +80,12 @@ def test_it_follows_setpoints_and_goals_and_stops(bus: Bus) -> None:
         assert np.abs(np.diff(steps, axis=0)).max() < 2.4 * STEPS * 0.5
         assert abs(steps[0, 0] - 2048 - START[0] * STEPS) < 3
         until(lambda: mode(robot) == Mode.HOLD, "it holds")
-        goal = BrainCommand("home", joint_target=so101().arm.home[:5], gripper=0.02)
+        goal = BrainCommand("home", joint_target=robot.body.arm.home[:5], gripper=0.02)
         assert robot.host.bridge.submit(goal) is None
         [result] = until(robot.take_results, "the goal ends")
         assert result.success, result
         found = robot.get_observation()
-        for joint, home in zip(JOINTS, so101().arm.home[:5], strict=False):
+        for joint, home in zip(JOINTS, robot.body.arm.home[:5], strict=False):
             assert found[f"{joint}.pos"] == pytest.approx(home, abs=0.03)
         robot.estop()
         until(lambda: mode(robot) == Mode.ESTOP, "it is stopped")
