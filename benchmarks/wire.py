@@ -30,6 +30,7 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -37,7 +38,8 @@ from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 
 Array = NDArray[np.float64]
 MONITORED = "wheels, monitored"
-SPACES = ("wheels", MONITORED, "joints", "tool", "impedance")
+SO101 = "joints, so101"
+SPACES = ("wheels", MONITORED, "joints", SO101, "tool", "impedance")
 KINDS = ("steps", "reversals", "spirals", "at the limits", "huge", "not finite", "on the spot")
 LIES = ("false", "drifting", "wrapped", "frozen", "counting twice", "from the future")
 ROUNDING = 1.021  # a trajectory ends inside a tick
@@ -121,6 +123,10 @@ def make(space: str, n: int) -> Any:
         task = AvoidTask(AvoidConfig(), n, base.rates.fps)
         base.reset(np.arange(n), [task.sample(seed) for seed in range(n)], range(n))
         return base
+    if space == SO101:
+        small = Simulation(SO101Config(), n)
+        small.reset(np.arange(n), [TableScene("empty", (), small.body.arm.home)] * n, range(n))
+        return small
     options: dict[str, Any] = {"joints": {}, "tool": {"action_space": "tool"}}.get(
         space, {"action_space": "tool", "control": "impedance"}
     )
@@ -142,8 +148,9 @@ def ranges(space: str, first: Array) -> tuple[Array, Array]:
     """Return the smallest and the largest sensible action, each of shape (actions,)."""
     if space in ("wheels", MONITORED):
         return np.array([-0.22, -2.84]), np.array([0.22, 2.84])
-    if space == "joints":
-        return np.array([*(-2 * np.pi,) * 6, 0.0]), np.array([*(2 * np.pi,) * 6, 0.085])
+    if space in ("joints", SO101):
+        turns = np.full(len(first) - 1, 2 * np.pi)
+        return np.array([*-turns, 0.0]), np.array([*turns, 0.085])
     lower, upper = first - 0.4, first + 0.4
     lower[3:7], upper[3:7], lower[7], upper[7] = -1.0, 1.0, 0.0, 0.085
     return lower, upper

@@ -87,7 +87,7 @@ ROBOTS: Registry[Any] = Registry(
 
 
 def _body_of(robot_type: str) -> Body:
-    body: Body = RobotConfig.get_choice_class(robot_type)().body()  # type: ignore[attr-defined]
+    body: Body = RobotConfig.get_choice_class(robot_type)().body()
     return body
 
 
