@@ -75,6 +75,7 @@ class Simulation(Host):
         first = 0
         for part in self.parts:
             part.touches = self._touches[first : (first := first + part.touch_kinds)]
+        self._touched = tuple(self._touches)
         self._reading = PlantReading(n, self.controller.joints)
         gyro = {"gyro": GYROSCOPE, "beams": config.beams} if body.drive is not None and config.imu else {}
         self._frames = Frames(world, self.cerebellum, self._touches, late=plant, brakes=joints.brakes, **gyro)
@@ -116,7 +117,7 @@ class Simulation(Host):
 
         By an arm the table, objects with one of its links, and the arm itself; then by a base the scene.
         """
-        return tuple(self._touches)
+        return self._touched
 
     def place(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Put robots into scenes, at rest at their start; `reset` does that and starts an episode."""
