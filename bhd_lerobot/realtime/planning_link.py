@@ -31,13 +31,13 @@ _LOG = logging.getLogger(__name__)
 _SLACK_S = 5.0  # [s] a trajectory may be longer than `MAX_DURATION_S` by a brake before it
 
 
-def _header_dtype(dof: int) -> np.dtype:
+def _header_dtype(dof: int, width: int) -> np.dtype:
     request = np.dtype(
         [
             ("number", np.int64),
             ("start_tick", np.int64),
             ("block", np.int64),
-            ("state", np.float64, (3, dof + 1)),
+            ("state", np.float64, (3, width)),
             ("has_opening", np.bool_),
             ("opening", np.float64),
             ("held", np.float64, (7,)),  # both ends and the radius of what is in the gripper [m]; 0 without it
@@ -58,7 +58,7 @@ def _header_dtype(dof: int) -> np.dtype:
             ("message", f"S{MESSAGE_BYTES}"),
             ("message_size", np.int16),
             ("rows", np.int64),
-            ("target", np.float64, (dof + 1,)),
+            ("target", np.float64, (width,)),
         ],
         align=True,
     )
@@ -67,11 +67,11 @@ def _header_dtype(dof: int) -> np.dtype:
 class _Memory:
     """The block of memory that both sides share."""
 
-    def __init__(self, buffer: Any, dof: int, control_hz: int, duration_s: float) -> None:
-        dtype = _header_dtype(dof)
+    def __init__(self, buffer: Any, dof: int, width: int, control_hz: int, duration_s: float) -> None:
+        dtype = _header_dtype(dof, width)
         capacity = self.capacity(control_hz, duration_s)
         self.header = np.frombuffer(buffer, dtype, 1)
-        shape = (2, capacity, 3, dof + 1)
+        shape = (2, capacity, 3, width)
         self.rows = np.frombuffer(buffer, np.float64, int(np.prod(shape)), offset=dtype.itemsize).reshape(shape)
         # One-element views: an aligned 64-bit store is atomic, see `CommandFifo`.
         self.guard, self.dropped, self.answered = (self.header[name] for name in ("guard", "dropped", "answered"))
@@ -88,7 +88,9 @@ class PlanningLink:
         lead: ticks from a request to the tick that its plan is to start at.
 
     Args:
-        buffer: memory of at least `nbytes(dof, control_hz, duration_s)` bytes, zeroed before its first use.
+        buffer: memory of at least `nbytes(dof, width, control_hz, duration_s)` bytes, zeroed before its first use.
+        dof: number of the arm's joints.
+        width: number of values of its state: with the gripper's opening, if it has one.
         control_hz: ticks a second [Hz].
         lead_s: from a request to the start of its plan [s].
         timeout_s: that an answer may take [s].
@@ -99,6 +101,7 @@ class PlanningLink:
         self,
         buffer: Any,
         dof: int,
+        width: int,
         control_hz: int,
         *,
         lead_s: float = LEAD_S,
@@ -108,7 +111,7 @@ class PlanningLink:
         if not (np.isfinite(timeout_s) and timeout_s > 0):
             raise ConfigError(f"The planner's time-out is {timeout_s!r} s; it must be positive, such as {TIMEOUT_S}.")
         self.lead, self.timeout = lead_ticks(control_hz, lead_s), round(timeout_s * control_hz)
-        self._memory = memory = _Memory(buffer, dof, control_hz, duration_s)
+        self._memory = memory = _Memory(buffer, dof, width, control_hz, duration_s)
         self._request: Any = memory.header["request"][0]
         self._answer: Any = memory.header[0]
         self._guard, self._dropped, self._answered = memory.guard, memory.dropped, memory.answered
@@ -119,9 +122,9 @@ class PlanningLink:
         self._played = 1  # the block that is, or may be, played
 
     @staticmethod
-    def nbytes(dof: int, control_hz: int, duration_s: float = MAX_DURATION_S) -> int:
+    def nbytes(dof: int, width: int, control_hz: int, duration_s: float = MAX_DURATION_S) -> int:
         """Return the size of the memory block [bytes]."""
-        return _header_dtype(dof).itemsize + 2 * _Memory.capacity(control_hz, duration_s) * 3 * (dof + 1) * 8
+        return _header_dtype(dof, width).itemsize + 2 * _Memory.capacity(control_hz, duration_s) * 3 * width * 8
 
     def request(  # noqa: PLR0917
         self,
@@ -185,7 +188,7 @@ class PlanServer:
     def __init__(self, buffer: Any, planner: GoalPlanner, *, duration_s: float = MAX_DURATION_S) -> None:
         self.newest: Trajectory | None = None
         self._planner = planner
-        self._memory = memory = _Memory(buffer, planner.dof, planner.hz, duration_s)
+        self._memory = memory = _Memory(buffer, planner.dof, planner.width, planner.hz, duration_s)
         self._header: Any = memory.header[0]
         self._guard, self._dropped, self._answered = memory.guard, memory.dropped, memory.answered
         # A request that another server has not answered is served; one that was answered is not served again.

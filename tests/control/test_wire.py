@@ -90,8 +90,8 @@ def torque_arm() -> StuckRig:
 
 def planned_arm() -> tuple[arm_rig.Rig, PlanningLink, PlanServer]:
     """Return an arm in the middle of a motion that another process planned."""
-    block = bytearray(PlanningLink.nbytes(6, arm_rig.HZ))
-    link, server = PlanningLink(block, 6, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
+    block = bytearray(PlanningLink.nbytes(6, 7, arm_rig.HZ))
+    link, server = PlanningLink(block, 6, 7, arm_rig.HZ), PlanServer(block, GoalPlanner(ARM, arm_rig.HZ))
     rig = arm(planning=link)
     assert rig.go(joint_target=arm_rig.posture(j0=1.5)) is None
     for _ in range(220):

@@ -28,7 +28,7 @@ class RampPlanner:
     """Plans as many ticks as the goal's `timeout_s` says, whose rows are the start and what its `gripper` adds."""
 
     def __init__(self, dof: int = 6, hz: int = 100) -> None:
-        self.dof, self.hz = dof, hz
+        self.dof, self.width, self.hz = dof, dof + 1, hz
         self.planned: list[BrainCommand] = []
 
     def plan(

@@ -89,8 +89,8 @@ def test_no_command_is_seen_before_it_is_whole(monkeypatch: pytest.MonkeyPatch) 
 
 def test_no_request_and_no_plan_is_seen_before_it_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     def linked() -> tuple[PlanningLink, bytearray]:
-        memory = bytearray(-(-PlanningLink.nbytes(6, 100, DURATION_S) // 8) * 8)
-        return PlanningLink(memory, 6, 100, duration_s=DURATION_S), memory
+        memory = bytearray(-(-PlanningLink.nbytes(6, 7, 100, DURATION_S) // 8) * 8)
+        return PlanningLink(memory, 6, 7, 100, duration_s=DURATION_S), memory
 
     link, memory = linked()
     for seen in memories(memory, lambda: link.request(0, GOAL, STATE, 0.05, 17), monkeypatch):
@@ -112,8 +112,8 @@ def test_who_reads_has_a_fence_after_the_counter_and_one_before_it_is_looked_at_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ring, mailbox = StateRing(support.STATE, 2), Mailbox(RECORD, 2)
-    planner, memory = RampPlanner(), bytearray(PlanningLink.nbytes(6, 100, DURATION_S))
-    link = PlanningLink(memory, 6, 100, duration_s=DURATION_S)
+    planner, memory = RampPlanner(), bytearray(PlanningLink.nbytes(6, 7, 100, DURATION_S))
+    link = PlanningLink(memory, 6, 7, 100, duration_s=DURATION_S)
     server = PlanServer(memory, planner, duration_s=DURATION_S)  # type: ignore[arg-type]
     reader = RingReader(ring)
     ring.publish(np.zeros(1, support.STATE))

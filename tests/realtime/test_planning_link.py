@@ -31,8 +31,8 @@ def ramp(ticks: int, step: float = 1.0, **fields: Any) -> BrainCommand:
 
 def linked(planner: Any = None) -> tuple[PlanningLink, PlanServer, Any, bytearray]:
     planner = planner or RampPlanner()
-    block = bytearray(PlanningLink.nbytes(planner.dof, planner.hz, DURATION_S))
-    link = PlanningLink(block, planner.dof, planner.hz, duration_s=DURATION_S)
+    block = bytearray(PlanningLink.nbytes(planner.dof, planner.width, planner.hz, DURATION_S))
+    link = PlanningLink(block, planner.dof, planner.width, planner.hz, duration_s=DURATION_S)
     return link, PlanServer(block, planner, duration_s=DURATION_S), planner, block
 
 
@@ -51,8 +51,8 @@ def answer(link: PlanningLink) -> Plan:
     ],
 )
 def test_a_plan_is_the_planners_bit_for_bit_and_lies_in_the_shared_memory(command: BrainCommand) -> None:
-    block = bytearray(PlanningLink.nbytes(6, HZ))
-    link, server = PlanningLink(block, 6, HZ), PlanServer(block, PLANNER)
+    block = bytearray(PlanningLink.nbytes(6, 7, HZ))
+    link, server = PlanningLink(block, 6, 7, HZ), PlanServer(block, PLANNER)
     state = State.at_rest(HOME)
     assert not server.serve_once()
     link.request(0, command, state, 0.05, 17)
@@ -210,7 +210,7 @@ def test_a_half_written_request_is_not_read() -> None:
     guard += 1
     assert not server.serve_once()
     # After a writer that was killed while writing, the next one can write again.
-    again = PlanningLink(block, 6, 100, duration_s=DURATION_S)
+    again = PlanningLink(block, 6, 7, 100, duration_s=DURATION_S)
     assert guard[0] % 2 == 0
     again.request(0, ramp(4), STATE, None, 0)
     assert server.serve_once()
@@ -248,8 +248,8 @@ def test_a_restarted_planner_answers_only_open_requests() -> None:
 
 def test_another_process_plans(tmp_path: Path) -> None:
     path, count = tmp_path / "block", 200
-    block = shared_block(path, PlanningLink.nbytes(6, 100, DURATION_S))
-    link = PlanningLink(block, 6, 100, duration_s=DURATION_S)
+    block = shared_block(path, PlanningLink.nbytes(6, 7, 100, DURATION_S))
+    link = PlanningLink(block, 6, 7, 100, duration_s=DURATION_S)
     process = Fork(serve_plans, path, count)
     playing_rows: tuple[np.ndarray, np.ndarray] | None = None
     for number in range(1, count + 1):
@@ -273,10 +273,10 @@ def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(ConfigError, match="arm 1"):
         link.request(1, ramp(3), STATE, None, 0)
     with pytest.raises(ValueError, match="buffer"):
-        PlanningLink(bytearray(PlanningLink.nbytes(6, 100, 2.0) - 1), 6, 100, duration_s=2.0)
+        PlanningLink(bytearray(PlanningLink.nbytes(6, 7, 100, 2.0) - 1), 6, 7, 100, duration_s=2.0)
     for timeout_s in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ConfigError, match="time-out is"):
-            PlanningLink(bytearray(PlanningLink.nbytes(6, 100)), 6, 100, timeout_s=timeout_s)
+            PlanningLink(bytearray(PlanningLink.nbytes(6, 7, 100)), 6, 7, 100, timeout_s=timeout_s)
 
 
 def test_garbage_over_a_request_ends_no_planner() -> None:
@@ -287,7 +287,7 @@ def test_garbage_over_a_request_ends_no_planner() -> None:
         np.frombuffer(block, np.int64)[:2] = 2 * number + 2, number + 1  # a request that is whole, and new
         server.serve_once()
     _, server, planner, block = linked()
-    link = PlanningLink(block, planner.dof, planner.hz, duration_s=DURATION_S)
+    link = PlanningLink(block, planner.dof, planner.width, planner.hz, duration_s=DURATION_S)
     link.request(0, ramp(3), STATE, None, 0)
     assert server.serve_once()
     assert len(answer(link).rows) == 3

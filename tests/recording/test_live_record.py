@@ -7,6 +7,7 @@ import pty
 import re
 import signal
 import time
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from tests.robots.host.support import is_alive, is_gone, unique
 from tests.waiting import until
 
 LIVE = {"robot__clock": "realtime", "robot__realtime__brain_timeout_s": 20, "robot__realtime__most_misses": 10**6}
+SO101 = str(resources.files("bhd_lerobot.bodies").joinpath("so101.xml"))
 ARM = {"robot__type": "ur5", "robot__beams": None, "brain__type": "pick", "task__type": "pick"}
 
 
@@ -49,6 +51,13 @@ def run_live(root: Path, **overrides: object) -> tuple[RecordResult, str]:
 
 def episodes(root: Path) -> list[dict[str, Any]]:
     return pq.read_table(root / "meta" / "episodes").to_pylist()
+
+
+def test_an_arm_without_a_gripper_gets_to_its_goals(tmp_path):
+    file = {"robot__mjcf": SO101, "robot__tool": "gripper_frame", "robot__gripper__name": "none"}
+    names = {"robot__type": "arm", "robot__beams": None, "task__type": "reach", "brain__type": "reach"}
+    result, _ = run_live(tmp_path / "d", **names, **file, dataset__episode_time_s=None, task__duration_s=60)
+    assert (result.recorded, result.successes) == (2, 2)
 
 
 @pytest.mark.thorough(but=1)

@@ -60,7 +60,6 @@ def test_tasks_are_solved_by_rule(task: str, robot: str, bare: Path, tmp_path: P
         ({"mjcf": "bare", "tool_offset": [0.0, np.nan, 0.0]}, "three finite numbers"),
         ({"mjcf": "bare", "gripper": GripperOptions(name="jaw")}, "robot.gripper.name"),
         ({"mjcf": "bare", "control": "impedance", "action_space": "tool"}, "has position servos"),
-        ({"mjcf": "bare", "clock": "realtime"}, "has no gripper"),
         ({"mjcf": "bare", "payload": 50.0}, "carries between 0 and"),
     ],
 )

@@ -68,6 +68,7 @@ class GoalPlanner:
         self.arm, self.hz = arm, control_hz
         self.kinematics = ArmKinematics(arm.chain, arm.limits)
         self.dof = dof = len(arm.chain.joints)
+        self.width = len(arm.limits.names)
         self.limits = MotionLimits.of(arm.limits)
         self.stop_limits = MotionLimits.of(arm.limits, stop=True)
         self._arm, self._gripper = slice(0, dof), slice(dof, dof + 1)

@@ -14,6 +14,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.control.messages import NANOSECONDS
@@ -56,7 +57,7 @@ class LiveLink:
         if goals is not None:
             from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 
-            plans = PlanningLink.nbytes(dof, rates.control_hz)
+            plans = PlanningLink.nbytes(dof, len(mirror.body.need(Arm).limits.names), rates.control_hz)
         layout = LiveLayout(
             published_dtype(mirror),
             max(64, math.ceil(realtime.buffer_s * rates.control_hz) + 2),

@@ -115,7 +115,8 @@ class LiveProcess:
         if len(plans := self._block.section("plan")) and spec.body.arm is not None:
             from bhd_lerobot.realtime.planning_link import PlanningLink
 
-            planning = PlanningLink(plans, len(spec.body.arm.chain.joints), spec.rates.control_hz)
+            arm = spec.body.arm
+            planning = PlanningLink(plans, len(arm.chain.joints), len(arm.limits.names), spec.rates.control_hz)
         self._plant = spec.make_plant() if spec.plant else None
         if self._plant is not None:
             self._plant.open()

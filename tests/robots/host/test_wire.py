@@ -176,7 +176,7 @@ def expect_no_jump(states: States, robot: UR5) -> None:
 def test_garbage_over_the_rows_of_a_trajectory_stops_the_arm(arm: tuple[UR5, States], what: str) -> None:
     robot, states = arm
     turn(robot, f"garbage {what}", 1.0 if what == "a jump" else -1.0)
-    link = PlanningLink(states.block.section("plan"), 6, HZ)
+    link = PlanningLink(states.block.section("plan"), 6, 7, HZ)
     rows = link._memory.rows
     rows[...] = np.nan if what == "not a number" else rows + 1.0
     until(lambda: states.has(Mode.FAULT), "it is a fault")
