@@ -15,6 +15,7 @@ MOST_OBSTACLES = 4
 _TRIES = 200
 _APART = 1.2  # [m] between the places in front of the two stands
 _BEFORE = 0.42  # [m] from the object to the place in front of its stand
+_FREE = 0.25  # [m] around the spots, no obstacle
 _NEAR = 0.08  # [m] a place of the grid that is nearer is there
 
 
@@ -80,7 +81,7 @@ def make_fetch_scene(seed: int, body: Body, obstacles: int = MOST_OBSTACLES) -> 
         if math.dist(*ends) < _APART:
             continue
         x, y, turned = rng.uniform((room - half_x, room - half_y, -math.pi), (half_x - room, half_y - room, math.pi))
-        others = (_draw_obstacle(rng, half) for _ in range(rng.integers(obstacles + 1)))
+        others = tuple(_draw_obstacle(rng, half) for _ in range(rng.integers(obstacles + 1)))
         arena = Arena(
             name="fetch",
             shapes=(*outer_walls(half_x, half_y), first, second, *others),
@@ -88,6 +89,9 @@ def make_fetch_scene(seed: int, body: Body, obstacles: int = MOST_OBSTACLES) -> 
             start=(float(x), float(y), float(turned)),
             robot_radius=drive.radius,
         )
+        spots = np.array([(pick.x, pick.y), (place.x, place.y)])
+        if (Arena("", others, arena.extent, arena.start).clearance(spots) < _FREE).any():
+            continue
         points, free = arena.reachable
         near = [(free & (np.hypot(*(points - end).transpose(2, 0, 1)) < _NEAR)).any() for end in ends]
         if not all(near) or (arena.clearance(np.array([(x, y), *ends])) < room).any():

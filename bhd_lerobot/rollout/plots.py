@@ -15,6 +15,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import Arena
+from bhd_lerobot.bodies.fetch_scene import FetchScene
 from bhd_lerobot.bodies.tabletop import COLOURS, TableScene
 
 SHOWN = 40  # episodes of a run that are drawn: a panel takes 0.1 s, and more are no longer looked at one by one
@@ -123,6 +124,9 @@ def draw_scene(axes: Axes, scene: Arena | TableScene) -> None:
     """Draw what is around the robot from above, to scale."""
     if isinstance(scene, Arena):
         draw_arena(axes, scene)
+    elif isinstance(scene, FetchScene):
+        draw_arena(axes, scene.arena)
+        _draw_objects(axes, scene)
     else:
         draw_table(axes, scene)
 
@@ -131,6 +135,12 @@ def draw_table(axes: Axes, scene: TableScene) -> None:
     """Draw the objects before an arm from above, to scale, the base of the arm at the left."""
     axes.set_facecolor(_FREE)
     axes.add_patch(Circle((0.0, 0.0), 0.075, color=_WALL, linewidth=0))
+    _draw_objects(axes, scene)
+    _frame_axes(axes, (-0.15, 0.85, -0.5, 0.5))
+
+
+def _draw_objects(axes: Axes, scene: TableScene) -> None:
+    """Draw the objects of a scene, with a ring around the target, and the wanted pose."""
     for number, item in enumerate(scene.objects):
         edge: dict[str, Any] = {"facecolor": COLOURS[item.colour], "edgecolor": "black"}
         edge["linewidth"] = 0.3
@@ -147,7 +157,6 @@ def draw_table(axes: Axes, scene: TableScene) -> None:
             )
     if scene.target_pose is not None:
         axes.plot(*scene.target_pose[:2], marker="+", color="black", markersize=8, markeredgewidth=1.5)
-    _frame_axes(axes, (-0.15, 0.85, -0.5, 0.5))
 
 
 def _frame_axes(axes: Axes, limits: tuple[float, float, float, float]) -> None:

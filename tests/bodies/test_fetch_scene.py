@@ -56,4 +56,7 @@ def test_the_robot_fits_everywhere_it_has_to_go_and_reaches_what_it_has_to(scene
     assert arena.clearance(np.array([scene.place.x, scene.place.y])) <= -0.04
     assert 2 * math.hypot(thing.size_x, thing.size_y) <= BODY.arm.gripper.max_opening
     assert thing.mass <= BODY.arm.payload
+    for shape in arena.shapes[6:]:  # behind walls and stands
+        for stand in (scene.pick, scene.place):
+            assert math.hypot(shape.x - stand.x, shape.y - stand.y) > 0.25
     assert math.dist((scene.pick.x, scene.pick.y), (scene.place.x, scene.place.y)) > 0.5

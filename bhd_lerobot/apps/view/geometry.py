@@ -28,6 +28,9 @@ def scene_of(row: Row) -> dict[str, Any] | None:
         return None
     if not isinstance(scene, dict):
         return None
+    if isinstance(arena := scene.get("arena"), dict):
+        x, y, yaw = (float(scene["place"][name]) for name in ("x", "y", "yaw"))
+        return {"kind": "arena", **arena, "goal": [x, y, yaw]}
     if "extent" in scene and "shapes" in scene:
         return {"kind": "arena", **scene}
     if "objects" in scene:
@@ -61,7 +64,7 @@ def views_of(
             "x": lidar.ahead if lidar else 0.0,
         }
     arm, drive = (body.arm, body.drive) if body else (None, None)
-    if arm is not None and (joints := _joints(arm, names, observed, physics)) is not None:
+    if arm is not None and drive is None and (joints := _joints(arm, names, observed, physics)) is not None:
         capsules = arm.chain.capsules
         hand = next(number for number, capsule in enumerate(capsules) if capsule.frame == len(arm.chain.joints))
         about["arm"] = {"radii": [capsule.radius for capsule in capsules], "hand": hand}

@@ -30,6 +30,7 @@ _ENDS = (
     "place_ahead_sin",
 )
 _BEFORE = 0.42  # [m] from the spot to where the base comes to by its scans
+_ASLANT = 0.3  # [rad] by which it looks aslant at a stand at the most
 _FROM = 0.085  # [m] before the object, the tool begins its line: the fingers' tips are not at it yet
 _ROOM = 0.012  # [m] under the hand: servos sag
 _RELEASE = 0.004  # [m] above where it stood, an object is let go of
@@ -163,8 +164,15 @@ class FetchBrain(GoalBrain):
 
     @staticmethod
     def _before(view: _View, end: int) -> tuple[float, float, float, float]:
-        """Return the pose before one of the two stands, in the robot's frame: x, y, cosine and sine."""
+        """Return the pose before one of the two stands, in the robot's frame: x, y, cosine and sine.
+
+        Before the nearest side of a box: fingers that meet it aslant jam on its corners.
+        """
         (x, y, _), (cos, sin) = view.spots[end], view.ahead[end]
+        if end == _PICK and view.thing.kind == "box":
+            aslant = (view.thing.yaw - math.atan2(sin, cos) + math.pi / 4) % (math.pi / 2) - math.pi / 4
+            yaw = math.atan2(sin, cos) + min(max(aslant, -_ASLANT), _ASLANT)
+            cos, sin = math.cos(yaw), math.sin(yaw)
         return x - _BEFORE * cos, y - _BEFORE * sin, cos, sin
 
     # --- the plan, a step after the other; each goes on with the next observation, or when its goal has ended ---------

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.options.declared import Finite, Range
 from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns, find_scan
+from bhd_lerobot.policies.navigation.driving import resting
 
 _ROUNDING = 1e-6  # [m]
 
@@ -55,14 +56,14 @@ class AvoidanceBrain(ConfiguredBrain):
         self._scan = slice(0)
         self._front: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._forward = self._turn = 0
-        self._width = 0
+        self._rest = np.zeros(0)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist."""
         self._scan, angles = find_scan(robot.observation_names, self.name)
         self._front = np.abs(angles) <= math.radians(self.config.front_sector_deg) + 1e-9
         self._forward, self._turn = find_columns(robot.action_names, ("x.vel", "theta.vel"), self.name, "action")
-        self._width = len(robot.action_names)
+        self._rest = resting(robot, self.name)
 
     def act(self, observation: Observation) -> NDArray[np.float64]:
         """Return the twist, shape (n, actions)."""
@@ -73,7 +74,7 @@ class AvoidanceBrain(ConfiguredBrain):
         nearest = np.where(valid, front, np.inf).min(axis=1)
         seen = valid.any(axis=1)
         free = nearest >= config.safe_distance_m
-        action = np.zeros((len(front), self._width))
+        action = np.tile(self._rest, (len(front), 1))
         action[:, self._forward] = np.where(seen & free, config.forward_speed, 0.0)
         action[:, self._turn] = np.where(seen & ~free, config.turn_speed, 0.0)
         return action

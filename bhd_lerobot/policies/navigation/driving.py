@@ -75,6 +75,14 @@ class DrivingConfig(BrainConfig):
         )
 
 
+def resting(robot: RobotFeatures, who: str) -> Array:
+    """Return the action of a base that stands, with its arm over it if it has one, shape (actions,)."""
+    action = np.zeros(len(robot.action_names))
+    if robot.body is not None and (arm := robot.body.arm) is not None:
+        action[find_columns(robot.action_names, arm.limits.names, who, "action")] = arm.home
+    return action
+
+
 class DrivingBrain(ConfiguredBrain):
     """Reads a scan and the measured twist, and commands a twist along one of `_paths`, for `_n` robots."""
 
@@ -99,7 +107,7 @@ class DrivingBrain(ConfiguredBrain):
         self._reader = ScanReader(robot.observation_names, self.name, (config.range_min_m, config.range_max_m))
         self._measured = find_columns(robot.observation_names, _TWIST, self.name, "observation")
         self._commanded = find_columns(robot.action_names, _TWIST, self.name, "action")
-        self._width, self._dt = len(robot.action_names), 1.0 / robot.fps
+        self._rest, self._dt = resting(robot, self.name), 1.0 / robot.fps
         self._steering = Steering(
             self._paths,
             self._reader,
@@ -126,6 +134,6 @@ class DrivingBrain(ConfiguredBrain):
 
     def _twist(self, blind: NDArray[np.bool_], forward: Array, turn: Array) -> Array:
         """Return the action, shape (n, actions): a twist, each part of shape (n,), or rest where a robot is blind."""
-        action = np.zeros((len(blind), self._width))
+        action = np.tile(self._rest, (len(blind), 1))
         action[:, self._commanded] = np.where(blind, 0.0, (forward, turn)).T
         return action

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
+from bhd_lerobot.apps.view.geometry import scene_of, views_of
 from bhd_lerobot.apps.view.groups import MAX_LINES, names_of, scan_of, sections, unit_of
 from bhd_lerobot.apps.view.packing import pack, unpack
+from bhd_lerobot.bodies.fetch_scene import make_fetch_scene
+from bhd_lerobot.bodies.scenes import scene_to_json
+from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.features import PHYSICS_STATE
 from tests.cases import each_case
 from tests.datasets.loader.support import length, record_ours
 
@@ -101,3 +106,17 @@ def test_subtasks_come_from_the_language_column_where_no_other_has_them(tmp_path
     header, _ = unpack(dataset.packed(0))
     assert header["bands"][0]["name"] == "subtask"
     assert len(header["bands"][0]["runs"]) == length(0)  # each frame has its own
+
+
+def test_an_arm_on_a_base_is_shown_in_its_arena() -> None:
+    scene = make_fetch_scene(0, turtlebot3_manipulation())
+    shown = scene_of({"bhd/scene": scene_to_json(scene)})
+    assert shown is not None
+    assert shown["kind"] == "arena"
+    assert len(shown["shapes"]) == len(scene.arena.shapes)
+    assert shown["goal"] == [scene.place.x, scene.place.y, scene.place.yaw]
+    physics = np.zeros((2, 94))
+    physics[:, :7] = 0.5, -1.0, 0.0, np.cos(0.35), 0.0, 0.0, np.sin(0.35)
+    about, arrays = views_of("turtlebot3_manipulation", {}, {PHYSICS_STATE: physics})
+    assert about["base"]["from"] == "simulator"
+    np.testing.assert_allclose(arrays["base"], [(0.5, -1.0, 0.7)] * 2, atol=1e-6)
