@@ -56,7 +56,7 @@ class AvoidanceBrain(ConfiguredBrain):
         self._scan = slice(0)
         self._front: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._forward = self._turn = 0
-        self._rest = np.zeros(0)
+        self._rest: NDArray[np.float64] = np.zeros(0)
 
     def bind(self, robot: RobotFeatures) -> None:
         """Find the scan and the twist."""
