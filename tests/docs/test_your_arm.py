@@ -25,7 +25,7 @@ def run(folder: Path) -> int:
     """Run the page's commands, in short, in a folder with the file."""
     os.chdir(folder)
     sys.path.insert(0, str(folder))
-    text = PAGE.read_text(encoding="utf-8").replace("\\\n", " ")
+    text = PAGE.read_text(encoding="utf-8").partition("## From simulation to your arm")[0].replace("\\\n", " ")
     commands = re.findall(r"^(bhd-\w+) (.*)$", text, re.MULTILINE)
     assert [name for name, _ in commands] == list(SHORTER)
     for name, line in commands:
