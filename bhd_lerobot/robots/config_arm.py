@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import draccus
 import numpy as np
 from lerobot.robots.config import RobotConfig
 
@@ -15,10 +16,16 @@ from bhd_lerobot.bodies.so101 import JAW_READINGS, SO101
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import OneOf, Positive, Range
+from bhd_lerobot.options.parse import decode
 from bhd_lerobot.robots.config import BhdRobotConfig
 
 _DEVICE_PLANT = "bhd_lerobot.robots.device.plant:DevicePlant"
 _DEVICE_TIMEOUT_S = 0.1  # a serial bus repeats what was lost
+
+
+@dataclass
+class _Device:
+    device: RobotConfig
 
 
 @dataclass(kw_only=True)
@@ -69,12 +76,14 @@ class ArmConfig(BhdRobotConfig):
     held_clearance: bool = True
     obstacles: list[list[float]] = field(default_factory=list)
     wrench: bool = False
-    device: RobotConfig | None = None
+    device: dict[str, Any] = field(default_factory=dict)  # draccus would look for robots in robots without an end
     units: dict[str, Any] = field(default_factory=dict)
     servos: dict[str, list[float]] = field(default_factory=dict)
     stale_after_s: Positive = 0.1
 
     def __post_init__(self) -> None:
+        if isinstance(self.device, RobotConfig):
+            self.device = {"type": self.device.type, **draccus.encode(self.device)}
         if self.plant == "lerobot":
             self.plant, self.clock = _DEVICE_PLANT, "realtime"
             timeout_s = max(self.realtime.plant_timeout_s, _DEVICE_TIMEOUT_S)
@@ -96,17 +105,17 @@ class ArmConfig(BhdRobotConfig):
 
     def _check_device(self) -> None:
         if self.plant != _DEVICE_PLANT:
-            if self.device is not None or self.units:
-                name = "units" if self.device is None else "device"
+            if self.device or self.units:
+                name = "device" if self.device else "units"
                 raise ConfigError(f"robot.{name} is of plant=lerobot; add --robot.plant=lerobot or leave it out.")
-        elif self.device is None:
+        elif not self.device:
             raise ConfigError(
                 "robot.plant is 'lerobot', and robot.device is not set: say which robot of LeRobot it is, for example "
                 "--robot.device.type=so101_follower --robot.device.port=/dev/ttyACM0 --robot.device.id=arm."
             )
-        elif isinstance(self.device, BhdRobotConfig):
+        elif isinstance(self.device_config, BhdRobotConfig):
             raise ConfigError(
-                f"robot.device.type is {self.device.type!r}, a robot of this package; name one that LeRobot drives."
+                f"robot.device.type is {self.device['type']!r}, a robot of this package; name one that LeRobot drives."
             )
         elif self.control != "servo":
             raise ConfigError(
@@ -118,20 +127,29 @@ class ArmConfig(BhdRobotConfig):
             raise ConfigError(f"robot.servos is of arms from a file, and those of {self.type} are known: leave it out.")
 
     @property
+    def device_config(self) -> RobotConfig:
+        """The configuration of the device.
+
+        Raises:
+            ConfigError: there is none of its type, or an option is missing or not valid.
+        """
+        return decode(_Device, {"device": dict(self.device)}, "robot.").device
+
+    @property
     def notes(self) -> list[str]:
         """What a device does not tell, for whoever starts it."""
-        if self.device is None:
+        if not self.device:
             return []
         return [
-            f"{self.device.type} tells positions only: speeds are the slopes of its last readings, efforts are not "
+            f"{self.device['type']} tells positions only: speeds are the slopes of its last readings, efforts are not "
             "known, so robot.max_force limits nothing. Commands make up for the arm's weight, not for what it holds."
         ]
 
     def plant_values(self) -> dict[str, Any]:
         """Return what the plant in another process, without a class of LeRobot, needs besides plain options."""
-        if self.device is None:
+        if not self.device:
             return {}
-        return {"device": pickle.dumps(self.device), "units": {**self.usual_units, **self.units}}
+        return {"device": pickle.dumps(self.device_config), "units": {**self.usual_units, **self.units}}
 
     @property
     def capsules(self) -> list[Capsule]:

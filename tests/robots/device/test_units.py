@@ -1,10 +1,13 @@
 """What readings of LeRobot's robots mean, and the options that say it."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
+import draccus
 import numpy as np
 import pytest
+from lerobot.robots.config import RobotConfig
 from lerobot.robots.so_follower import SO101FollowerConfig
 
 from bhd_lerobot.errors import ConfigError
@@ -15,6 +18,12 @@ from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.device.process import Speed
 from bhd_lerobot.robots.device.units import Motor, unit_of
 from tests.cases import each_case
+
+
+@dataclass
+class Stock:
+    robot: RobotConfig
+
 
 FEATURES = ("elbow.pos", "joint_3.pos", "gripper.pos")
 DEGREES, SHARE, CLOSING = Motor("DEGREES", 1.5), Motor("RANGE_M100_100", 1.5), Motor("RANGE_0_100", 0.9)
@@ -71,6 +80,8 @@ def test_what_means_nothing_is_refused(row: Any, motor: Motor, text: str) -> Non
         (lambda: SO101Config(device=DEVICE), "robot.device is of plant=lerobot; add --robot.plant=lerobot"),
         (lambda: SO101Config(units={"gripper": "deg"}), "robot.units is of plant=lerobot"),
         (lambda: SO101Config(plant="lerobot", device=SO101Config()), "'so101', a robot of this package"),
+        (lambda: SO101Config(plant="lerobot", device={"type": "so102"}), r"robot\.device\.type.*so101_follower"),
+        (lambda: SO101Config(plant="lerobot", device={"type": "so101_follower"}), r"robot\.device\.port is required"),
         (
             lambda: TurtleBot3Config(plant="lerobot"),
             "name a class as package.module:Class; or ros2",
@@ -85,6 +96,13 @@ def test_what_means_nothing_is_refused(row: Any, motor: Motor, text: str) -> Non
 def test_options_that_fit_nothing_are_refused(make: Any, text: str) -> None:
     with pytest.raises(ConfigError, match=text):
         make()
+
+
+def test_lerobots_own_commands_take_a_device() -> None:
+    line = "{type: so101_follower, port: /dev/none, id: arm}"
+    config = draccus.parse(Stock, args=["--robot.type=so101", "--robot.plant=lerobot", f"--robot.device={line}"]).robot
+    assert config.device_config == SO101FollowerConfig(port="/dev/none", id="arm")
+    assert config.clock == "realtime"
 
 
 def test_speeds_are_slopes_of_the_last_readings() -> None:
