@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body, Drive, LidarSpec
+from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.collision_monitor import new_monitors
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.drive import BaseController
@@ -103,5 +104,9 @@ class DrivePart(Part):
 
 
 def arena_of(scene: Any) -> Any:
-    """Return the arena of a scene, which is one, or has one."""
+    """Return the arena of a scene, which is one, or has one; an empty one of a scene that is a tabletop alone."""
+    if isinstance(scene, TableScene) and not hasattr(scene, "arena"):
+        from bhd_lerobot.bodies.arenas import make_arena  # imports SciPy
+
+        return make_arena("empty", 0)
     return getattr(scene, "arena", scene)

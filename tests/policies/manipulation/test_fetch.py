@@ -10,11 +10,15 @@ from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, Res
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.fetch import FetchBrain, FetchBrainConfig
+from bhd_lerobot.policies.manipulation.reach import ReachBrain
+from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.fetch import ENVIRONMENT, FetchConfig, FetchTask
+from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 
 BODY, FPS, EPISODES = turtlebot3_manipulation(), 20, 6
@@ -134,3 +138,16 @@ def test_what_is_not_told_is_named() -> None:
     for names in ((), ENVIRONMENT[:-1]):
         with pytest.raises(ConfigError, match="environment"):
             FetchBrain().bind(RobotFeatures(NAMES, BODY.limits.names, FPS, names, BODY))
+
+
+def test_the_arm_of_a_base_reaches_in_an_empty_arena_and_its_base_navigates_with_the_arm_at_home() -> None:
+    config, specs = TurtleBot3ManipulationConfig(), [EpisodeSpec(0, 3), EpisodeSpec(1, 5)]
+    body = config.body()
+    reach = EpisodeLoop(Simulation(config, 2), ReachTask(ReachConfig(), 2, config.fps, body), ReachBrain())
+    assert [one.outcome.event for one in reach.run(specs, lambda: False)] == [Event.SUCCESS] * 2
+    drive = EpisodeLoop(Simulation(config, 2), NavigateTask(NavigateConfig(), 2, config.fps, body), NavigatorBrain())
+    for episode in drive.run(specs, lambda: False):
+        assert episode.outcome.event == Event.SUCCESS
+        np.testing.assert_allclose(
+            episode.columns["control.applied_action"][:, :5], np.tile(HOME[:5], (episode.frames, 1)), atol=1e-6
+        )
