@@ -141,13 +141,14 @@ def test_its_processes_may_die(bus: Bus, victim: str) -> None:
     assert bus.is_on == (victim != "none")  # at an orderly end the device's own options count
 
 
-def test_shares_of_its_range_are_the_same_positions(bus: Bus) -> None:
+def test_shares_of_its_range_are_the_same_positions_for_one_program_at_a_time(bus: Bus) -> None:
     options = bus.config(bus.device(use_degrees=False))
     plant = DevicePlant(SimpleNamespace(**options.plant_values(), rates=options.rates), options.body())
     reading = PlantReading(1, 6)
     try:
         plant.open()
         plant.read(reading)
+        assert "is used by process" in refusal(bus.device())
     finally:
         plant.close()
     np.testing.assert_allclose(reading.position[0, :5], START[:5], atol=0.1)
