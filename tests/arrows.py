@@ -34,7 +34,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("bodies.body", "bodies.scenes", "bodies.tabletop", "bodies.truth", "robots.parts"),
         *("sim", "control.*", "realtime", "datasets.format", "ros2.live.network"),
     ),
-    "robots.parts": ("bodies.body", "bodies.tabletop", "sim", "control.*"),
+    "robots.parts": ("bodies.body", "bodies.arenas", "bodies.tabletop", "sim", "control.*"),
     "robots.viewer": ("bodies.scenes", "realtime", "robots.host", "sim.window"),
     "robots.external": ("realtime", "options", "bodies.body", "control", "datasets.format", "robots.host"),
     "robots.device": ("options", "bodies.body", "control", "control.geometry", "robots.external"),

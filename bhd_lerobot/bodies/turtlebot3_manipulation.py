@@ -8,15 +8,16 @@ Sources:
            are, the joints' ranges, boxes of the outlines, masses, centres of mass and inertias of the links. As of the
            Burger, see turtlebot3.py, the base's centre of mass and the scanner's inertia are ours; the base is made
            heavier, and its inertia in the same ratio, until the robot without the arm has the published mass.
+[nav]      ROBOTIS `turtlebot3_navigation2`, `waffle_pi.yaml`: 3.2 rad/s^2.
 [servo]    ROBOTIS e-Manual, XM430-W350, of the arm: 4.1 N m of stall torque at 12 V; XM430-W210, of the wheels: 2.7 N m
            at 11.1 V; 4096 pulses per revolution.
 
 Estimates of ours: the stiffness of the arm's servos, whose position loop has an integral part: 80 N m/rad, where the
 proportional part alone has 19; their damping, their largest speed, which is a third of that without a load, and the
 reflected rotor inertias; friction; thickness and height of the fingers, which meet when the gripper is closed and open
-by as much as the published strokes differ; the gripper's force; accelerations and jerks, with which the base neither
-rocks nor tips, on wheels that have no caster before them; the payload: 0.25 kg at full reach ahead tip it over; and
-what is an estimate in turtlebot3.py.
+by as much as the published strokes differ; the gripper's force; other accelerations and jerks, with which the base
+neither rocks nor tips, on wheels that have no caster before them; the payload: 0.25 kg at full reach ahead tip it over;
+and what is an estimate in turtlebot3.py.
 """
 
 import math
@@ -139,7 +140,7 @@ def turtlebot3_manipulation(
             limits=Limits(
                 names=("x.vel", "theta.vel"),
                 velocity=(MAX_LINEAR, MAX_ANGULAR),
-                acceleration=(1.0, 2.0),
+                acceleration=(1.0, 3.2),
                 stop_deceleration=(1.0, 6.0),
                 command_timeout_s=command_timeout_s,
             ),

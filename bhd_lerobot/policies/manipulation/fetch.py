@@ -35,9 +35,11 @@ _FROM = 0.085  # [m] before the object, the tool begins its line: the fingers' t
 _ROOM = 0.012  # [m] under the hand: servos sag
 _RELEASE = 0.004  # [m] above where it stood, an object is let go of
 _THERE_M, _THERE_RAD = 0.06, 0.06  # off a pose at which the navigator rests
-_NEAR_M, _NEAR_RAD = 0.005, 0.1  # off a spot, the base stands before it
+_NEAR_M = 0.005  # [m] off a spot, the base stands before it
+_LOOK_M, _LOOK_MOST = 0.10, 0.5  # [m] ahead it looks at the line to the spot, and [rad] aslant at the most
 _SLOW_S = 0.5  # [s] a distance is driven as fast as it could be covered in this time
-_TURN, _TURN_MOST = 2.0, 0.5  # [1/s] a bearing is turned to that fast, and [rad/s] at the most
+_TURN, _TURN_MOST = 2.0, 0.5  # [1/s] a heading is turned to that fast, and [rad/s] at the most
+_REST = 0.05  # [m/s and rad/s] slower than this the base is at rest
 _REST_S = 0.4  # [s] the base stands before the arm moves
 _PICK, _PLACE = 0, 1
 
@@ -71,6 +73,7 @@ class _View(NamedTuple):
     spots: tuple[tuple[float, float, float], ...]
     ahead: tuple[tuple[float, float], ...]
     opening: float
+    is_at_rest: bool
     result: CommandResult | None
 
 
@@ -102,7 +105,9 @@ class FetchBrain(GoalBrain):
         self._error = np.tile(self.config.camera_error_m, 2)
         self._opening = int(find_columns(robot.observation_names, ["gripper.pos"], name, "observation")[0])
         self._held = find_columns(robot.action_names, arm.limits.names, name, "action")
-        self._driven = find_columns(robot.action_names, robot.need(Drive).limits.names, name, "action")
+        twist = robot.need(Drive).limits.names
+        self._driven = find_columns(robot.action_names, twist, name, "action")
+        self._speeds = find_columns(robot.observation_names, twist, name, "observation")
         self._width, self._fps, self._turns_at = len(robot.action_names), robot.fps, chain.base.position[:2]
         (near, _), (far, _) = arm.workspace.table
         self._reach = (near + far) / 2
@@ -160,7 +165,8 @@ class FetchBrain(GoalBrain):
             return self._views[sim]._replace(result=result)
         thing, (ahead_cos, ahead_sin, x, y, z, cos, sin) = found[0], row[len(_OBJECT) :].tolist()
         spots, ahead = (thing.position, (x, y, z)), ((ahead_cos, ahead_sin), (cos, sin))
-        return _View(thing, spots, ahead, float(seen.state[sim, self._opening]), result)
+        is_at_rest = bool((np.abs(seen.state[sim, self._speeds]) < _REST).all())
+        return _View(thing, spots, ahead, float(seen.state[sim, self._opening]), is_at_rest, result)
 
     @staticmethod
     def _before(view: _View, end: int) -> tuple[float, float, float, float]:
@@ -202,17 +208,18 @@ class FetchBrain(GoalBrain):
         while True:
             x, y, cos, sin = self._before(self._views[sim], end)
             is_there = math.hypot(x, y) <= _THERE_M and abs(math.atan2(sin, cos)) <= _THERE_RAD
-            if is_there and not self._twists[sim].any():
+            if is_there and not self._twists[sim].any() and self._views[sim].is_at_rest:
                 break
             yield self._setpoint(sim, *self._twists[sim])
         self._to[sim] = -1
         while True:
-            x, y, _ = self._views[sim].spots[end]
-            left, bearing = x - self._reach, math.atan2(y, x)
-            if abs(left) <= _NEAR_M and abs(bearing) <= _NEAR_RAD:
+            x, y, cos, sin = self._before(self._views[sim], end)
+            left = x * cos + y * sin + _BEFORE - self._reach
+            if abs(left) <= _NEAR_M:
                 break
-            most = self.config.near_speed
-            turn = min(max(_TURN * bearing, -_TURN_MOST), _TURN_MOST)
+            most, beside = self.config.near_speed, x * sin - y * cos  # of the line to the spot, the robot to its left
+            turn = math.atan2(sin, cos) - min(max(beside / _LOOK_M, -_LOOK_MOST), _LOOK_MOST)
+            turn = min(max(_TURN * turn, -_TURN_MOST), _TURN_MOST)
             yield self._setpoint(sim, min(max(left / _SLOW_S, -most), most), turn)
         for _ in range(math.ceil(_REST_S * self._fps)):
             yield self._setpoint(sim)
