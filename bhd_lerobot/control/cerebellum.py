@@ -454,6 +454,7 @@ class Cerebellum:
         self.states["mode_is_new"][mask] = True
         self.states["is_deactivating"][mask] = False
         self.states["entered"][mask] |= 1 << mode
+        self.states["has_setpoint"][mask] = False  # as in a tick that was interrupted
         self._tell_controller()
 
     def _mode_reasons(self) -> NDArray[np.int8]:

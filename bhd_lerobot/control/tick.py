@@ -130,7 +130,7 @@ def begin_tick(  # noqa: PLR0917
 @kernel()
 def end_tick(state: Any, limits: Any) -> None:
     """Do what comes after the controller: follow it with the mode, and guard what is written."""
-    follow_controller(state)
+    follow_controller(state, limits)
     if not guard(state, limits):
         # As hard as possible, from the last that was safe.
         state.watchdog |= _GUARD
@@ -150,6 +150,7 @@ def set_mode(state: Any, mode: int) -> None:
     state.is_at_rest = False  # of a robot that a stop has just begun for it is known in the next tick
     if mode != _TRACKING:
         state.entered |= 1 << mode
+        state.has_setpoint = False  # one that was taken before the stop and not followed yet moves nothing after it
 
 
 @kernel()
@@ -285,10 +286,11 @@ def take_command(state: Any, queue: Any, estop: Counts, limits: Any, now_ns: int
 
 
 @kernel()
-def follow_controller(state: Any) -> None:
+def follow_controller(state: Any, limits: Any) -> None:
     """Keep the mode in step with the controller.
 
-    TRACKING while a goal is followed, HOLD when all are done, FAULT for a robot that something is in the way of.
+    TRACKING while a goal is followed, HOLD when all are done and the base is at rest, FAULT for a robot that something
+    is in the way of.
     """
     if state.protective_stop:
         state.watchdog |= state.protective_stop  # whatever moved it there would keep pressing
@@ -299,7 +301,7 @@ def follow_controller(state: Any) -> None:
     if resumes or (state.busy and state.mode == _HOLD):
         state.by_goal = True
         set_mode(state, _TRACKING)
-    if state.by_goal and not state.busy:
+    if state.by_goal and not state.busy and (not limits.is_drive or is_base_at_rest(state, limits)):
         state.by_goal = False
         if state.mode == _TRACKING:
             set_mode(state, _HOLD)

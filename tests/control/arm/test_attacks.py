@@ -162,11 +162,15 @@ def test_an_arm_that_is_forgotten_in_motion_stays_where_it_is_commanded_to() -> 
     assert int(rig.cerebellum.take_flags()[1][0]) == 0
 
 
-def test_after_garbage_in_the_queue_an_arm_follows_nothing_before_it_is_reset() -> None:
+@pytest.mark.parametrize("rows", [[np.full(7, np.nan)], [off(j0=-0.3), np.full(7, np.nan)]], ids=["alone", "second"])
+def test_after_garbage_in_the_queue_an_arm_follows_nothing_before_it_is_reset(rows: list[np.ndarray]) -> None:
     rig = Rig()
     rig.stream(off(j0=0.05), 2)
-    rig.sequence += 1
-    rig.cerebellum.fifo.push(rig.sequence, rig.now, np.full((1, 7), np.nan), ONE)
+    for row in rows:  # all due in the same tick
+        rig.sequence += 1
+        rig.cerebellum.fifo.push(rig.sequence, rig.now, row[None], ONE)
+    rig.tick()
+    assert rig.mode == Mode.FAULT
     rig.tick(100)
     stopped = rig.cerebellum.written.copy()
     rig.send(off(j0=0.3))
