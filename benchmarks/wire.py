@@ -25,12 +25,14 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks._impedance_attacks import ATTACKS, attack
 from benchmarks._turns import status
+from bhd_lerobot.bodies.body import Arm, Drive
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Mode, Request
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.config_arm import SO101Config
+from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -38,20 +40,43 @@ from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 
 Array = NDArray[np.float64]
 MONITORED = "wheels, monitored"
-SO101 = "joints, so101"
-SPACES = ("wheels", MONITORED, "joints", SO101, "tool", "impedance")
+SO101, MOBILE = "joints, so101", "arm on a base"
+SPACES = ("wheels", MONITORED, "joints", SO101, "tool", "impedance", MOBILE)
 KINDS = ("steps", "reversals", "spirals", "at the limits", "huge", "not finite", "on the spot")
 LIES = ("false", "drifting", "wrapped", "frozen", "counting twice", "from the future")
 ROUNDING = 1.021  # a trajectory ends inside a tick
-# [rad] that a stop may need. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its largest speed within 0.6; an
-# arm that is found to be blocked for 50 ms goes on meanwhile.
+# [rad] that a stop may need, of joints and of wheels. A joint brakes from 2 rad/s within 0.2 rad, a wheel from its
+# largest speed within 0.6, and one that carries an arm, whose stop is gentler, within 1.5; an arm that is found to be
+# blocked for 50 ms goes on meanwhile.
+_OF_ARM = dict.fromkeys(LIES, 0.2) | dict.fromkeys(("drifting", "frozen", "counting twice"), 0.35)
 NEEDED = {
-    "joints": dict.fromkeys(LIES, 0.2) | dict.fromkeys(("drifting", "frozen", "counting twice"), 0.35),
-    "wheels": dict.fromkeys(LIES, 0.6),
+    "joints": {lie: (most,) for lie, most in _OF_ARM.items()},
+    "wheels": dict.fromkeys(LIES, (0.6,)),
+    MOBILE: {lie: (most, 1.5) for lie, most in _OF_ARM.items()},
 }
 # [rad/s, m/s] of joint and tool: a stop makes an arm no faster than this, or than it was, times what the servos of an
 # arm that is speeding up lag behind.
 SLOW, FASTER = (0.5, 0.25), 1.3
+
+
+def wire_of_arm(arm: Arm, hz: int) -> tuple[Array, ...]:
+    """Return the smallest and the largest command of an arm's actuators, its largest change, and of two changes."""
+    limits, lead = arm.limits, np.asarray(arm.lead_s)
+    effort = np.asarray(limits.effort[:-1])
+    change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
+    bend = np.asarray(limits.stop_deceleration) * (1 / hz + 2 * lead) / hz
+    lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2
+    if arm.actuation == "torque":
+        lower[:-1], upper[:-1], change[:-1] = -effort, effort, effort / 0.1 / hz
+        bend[:-1] = np.inf
+    return lower, upper, change, bend
+
+
+def wire_of_drive(drive: Drive, hz: int) -> tuple[Array, ...]:
+    """Return the same of wheels."""
+    stop, most = drive.limits.stop_deceleration, drive.max_wheel_speed
+    change = np.full(2, (stop[0] + stop[1] * drive.wheel_separation / 2) / drive.wheel_radius / hz)
+    return np.full(2, -most), np.full(2, most), change, np.full(2, np.inf)
 
 
 class Judge:
@@ -68,22 +93,10 @@ class Judge:
     def __init__(self, simulation: Any) -> None:
         self._plant, self.n = simulation.cerebellum.plant, simulation.n
         body, hz = simulation.body, simulation.rates.control_hz
-        limits = body.limits
-        if body.arm is not None:
-            lead = np.asarray(body.arm.lead_s)
-            effort = np.asarray(limits.effort[:-1])
-            change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
-            bend = np.asarray(limits.stop_deceleration) * (1 / hz + 2 * lead) / hz
-            lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2
-            if body.arm.actuation == "torque":
-                lower[:-1], upper[:-1], change[:-1] = -effort, effort, effort / 0.1 / hz
-                bend[:-1] = np.inf
-        else:
-            drive = body.drive
-            stop = limits.stop_deceleration
-            most = drive.max_wheel_speed
-            change = np.full(2, (stop[0] + stop[1] * drive.wheel_separation / 2) / drive.wheel_radius / hz)
-            lower, upper, bend = np.full(2, -most), np.full(2, most), np.full(2, np.inf)
+        parts = [wire_of_arm(body.arm, hz)] if body.arm is not None else []
+        if body.drive is not None:
+            parts.append(wire_of_drive(body.drive, hz))
+        lower, upper, change, bend = (np.concatenate(values) for values in zip(*parts, strict=True))
         self._lower, self._upper, self._change = lower - 1e-9, upper + 1e-9, change * ROUNDING + 1e-9
         self._bend = bend * ROUNDING + 1e-9
         self._last: Array | None = None
@@ -127,6 +140,11 @@ def make(space: str, n: int) -> Any:
         small = Simulation(SO101Config(), n)
         small.reset(np.arange(n), [TableScene("empty", (), small.body.arm.home)] * n, range(n))
         return small
+    if space == MOBILE:
+        config = TurtleBot3ManipulationConfig(beams=36)
+        mobile = Simulation(config, n)
+        mobile.reset(np.arange(n), [config.start_scene()] * n, range(n))
+        return mobile
     options: dict[str, Any] = {"joints": {}, "tool": {"action_space": "tool"}}.get(
         space, {"action_space": "tool", "control": "impedance"}
     )
@@ -151,6 +169,8 @@ def ranges(space: str, first: Array) -> tuple[Array, Array]:
     if space in ("joints", SO101):
         turns = np.full(len(first) - 1, 2 * np.pi)
         return np.array([*-turns, 0.0]), np.array([*turns, 0.085])
+    if space == MOBILE:
+        return np.array([*(-np.pi,) * 4, 0.0, -0.26, -1.82]), np.array([*(np.pi,) * 4, 0.055, 0.26, 1.82])
     lower, upper = first - 0.4, first + 0.4
     lower[3:7], upper[3:7], lower[7], upper[7] = -1.0, 1.0, 0.0, 0.085
     return lower, upper
@@ -277,15 +297,20 @@ class Followed:
     streams: int = 0
     stopped: int = 0
     unsafe: int = 0
-    moved: float = 0.0
+    moved: tuple[float, ...] = ()
     faster: float = 0.0
+
+    def is_short(self, space: str, lie: str) -> bool:
+        """Return whether the stops were followed by no more motion than they need."""
+        return all(moved <= most for moved, most in zip(self.moved, NEEDED[space][lie], strict=True))
 
 
 class Liar:
     """A plant whose readings are falsified, of each robot from a tick of its own on.
 
     Attributes:
-        moved: how far a joint was, at the most, from where a stop found it [rad], shape (n,).
+        dof: the joints of its arm.
+        moved: how far each joint was, at the most, from where a stop found it [rad], shape (n, joints and wheels).
         faster: how many times as fast a joint or the tool was after the stop as in the 0.1 s before it, or as `SLOW`.
 
     Args:
@@ -297,14 +322,18 @@ class Liar:
     def __init__(self, simulation: Any, lie: str, rng: np.random.Generator) -> None:
         self._plant, self.n, self._lie = simulation.cerebellum.plant, simulation.n, lie
         self._cerebellum, self._hz = simulation.cerebellum, simulation.rates.control_hz
-        joints = 6 if simulation.body.arm is not None else 2
+        arm, drive = simulation.body.arm, simulation.body.drive
+        self.dof = 0 if arm is None else len(arm.chain.joints)
+        wheels = () if drive is None else range(len(simulation.body.joints) - 2, len(simulation.body.joints))
+        self._columns = [*range(self.dof), *wheels]  # of joints and wheels
+        joints = len(self._columns)
         self._begin, self._tick = rng.integers(self._hz // 4, self._hz, self.n), 0
         self._rows, self._joint = np.arange(self.n), rng.integers(joints, size=self.n)
         self._by = rng.uniform(0.12, 3.0, self.n) * rng.choice([-1, 1], self.n)
-        self._held, self._joints = np.zeros((self.n, joints)), joints
+        self._held = np.zeros((self.n, joints))
         self._found, self._stopped = np.zeros((self.n, joints)), np.zeros(self.n, np.bool_)
-        self.moved, self.faster = np.zeros(self.n), np.zeros(self.n)
-        self._tool = ForwardKinematics(simulation.body.arm.chain) if simulation.body.arm is not None else None
+        self.moved, self.faster = np.zeros((self.n, joints)), np.zeros(self.n)
+        self._tool = ForwardKinematics(arm.chain) if arm is not None else None
         self._speeds = np.zeros((self._hz // 10, 2, self.n))  # of the fastest joint, and of the tool
         self._before, self._last = np.zeros((2, self.n)), np.full((self.n, joints), np.nan)
 
@@ -314,10 +343,10 @@ class Liar:
     def read(self, out: PlantReading) -> None:
         """Read, and falsify."""
         self._plant.read(out)
-        self._measure(out.position[:, : self._joints])
+        position, velocity = out.position[:, self._columns], out.velocity[:, self._columns]
+        self._measure(position.copy())
         since = self._tick - self._begin
         lies, rows, joint = since >= 0, self._rows, self._joint
-        position, velocity = out.position[:, : self._joints], out.velocity[:, : self._joints]
         self._held = np.where((since <= 0)[:, None], position, self._held)
         out.stamp_ns = np.full(self.n, self._tick * 10**9 // self._hz)
         if self._lie == "false":
@@ -336,19 +365,20 @@ class Liar:
             velocity[lies] = 0.0
         else:
             out.stamp_ns += np.where(lies, np.abs(self._by * 1e9), 0).astype(np.int64)
+        out.position[:, self._columns], out.velocity[:, self._columns] = position, velocity
         self._tick += 1
 
     def _measure(self, position: Array) -> None:
         stopped = self._cerebellum.mode >= Mode.ESTOP
         new = stopped & ~self._stopped
         self._found[new], self._stopped = position[new], stopped
-        away = np.abs(position - self._found).max(axis=1)
-        np.maximum(self.moved, away, out=self.moved, where=stopped)
+        away = np.abs(position - self._found)
+        np.maximum(self.moved, away, out=self.moved, where=stopped[:, None])
         rate = np.nan_to_num(position - self._last) * self._hz
         self._last = position.copy()
-        speed = np.abs(rate).max(axis=1), np.zeros(self.n)
+        speed = np.abs(rate[:, : self.dof or 2]).max(axis=1), np.zeros(self.n)
         if self._tool is not None:
-            moves = self._tool.jacobian(position)[:, :3] @ rate[:, :, None]
+            moves = self._tool.jacobian(position[:, : self.dof])[:, :3] @ rate[:, : self.dof, None]
             speed = speed[0], np.linalg.norm(moves[..., 0], axis=1)
         self._before[:, new] = self._speeds[:, :, new].max(axis=0)
         faster = (np.array(speed) / np.maximum(self._before, np.array(SLOW)[:, None])).max(axis=0)
@@ -362,15 +392,17 @@ def deceive(space: str, lie: str, streams: int, frames: int, seed: int) -> Follo
     rng = np.random.default_rng([seed, LIES.index(lie), SPACES.index(space)])
     liar = simulation.cerebellum.plant = Liar(simulation, lie, rng)
     judge = simulation.cerebellum.plant = Judge(simulation)
-    first = start_of(simulation)
+    first, gripper = start_of(simulation), liar.dof
     size, rate = rng.uniform(0.1, 0.5, first.shape), rng.uniform(0.5, 2.0, first.shape)
     for frame in range(frames):
         action = first + size * np.sin(rate * frame / simulation.rates.fps)
-        if space == "joints":
-            action[:, -1] = first[:, -1]
+        if simulation.body.arm is not None:
+            action[:, gripper] = first[:, gripper]
         simulation.step(action)
-    moved, faster = float(liar.moved.max()), float(liar.faster.max())
-    return Followed(streams, int((simulation.modes == Mode.FAULT).sum()), judge.unsafe, moved, faster)
+    parts = (liar.moved[:, : liar.dof], liar.moved[:, liar.dof :])
+    moved = tuple(float(part.max()) for part in parts if part.size)
+    stopped = int((simulation.modes == Mode.FAULT).sum())
+    return Followed(streams, stopped, judge.unsafe, moved, float(liar.faster.max()))
 
 
 def impedance_table(streams: int, frames: int, seed: int) -> tuple[Table, int]:
@@ -451,9 +483,9 @@ def main(arguments: list[str] | None = None) -> int:
     for space in NEEDED:
         for lie in LIES:
             one = deceive(space, lie, options.streams, options.frames, options.seed)
-            unsafe += one.unsafe + (one.moved > NEEDED[space][lie]) + (space == "joints" and one.faster > FASTER)
+            unsafe += one.unsafe + (not one.is_short(space, lie)) + (space != "wheels" and one.faster > FASTER)
             numbers = (f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}")
-            lies.add_row(space, lie, *numbers, f"{one.moved:.3f} rad", f"{one.faster:.2f}")
+            lies.add_row(space, lie, *numbers, " / ".join(f"{way:.3f} rad" for way in one.moved), f"{one.faster:.2f}")
     console.print(lies)
     table, found = impedance_table(options.streams, options.frames, options.seed)
     console.print(table)

@@ -25,7 +25,7 @@ def test_whatever_is_read_a_stop_is_followed_by_no_more_motion_than_it_needs(spa
     for lie in wire.LIES:
         one = wire.deceive(space, lie, 12, 50, 1)
         assert one.unsafe == 0
-        assert one.moved < wire.NEEDED[space][lie]
+        assert one.is_short(space, lie)
         assert one.faster < wire.FASTER or space == "wheels"
         assert one.stopped or (space, lie) in {("wheels", "drifting"), ("wheels", "counting twice")}
 
