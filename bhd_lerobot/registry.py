@@ -185,9 +185,9 @@ def parts_of(robot: Any) -> Set[type]:
     return body.parts.keys()
 
 
-def robots_with(needs: Set[type]) -> list[str]:
-    """Return the types of the robots that have some parts."""
-    return sorted(name for name in ROBOTS if needs <= parts_of(name))
+def robots_with(needs: Set[type], excludes: Set[type] = frozenset()) -> list[str]:
+    """Return the types of the robots that have some parts, and others not."""
+    return sorted(name for name in ROBOTS if needs <= (parts := parts_of(name)) and not excludes & parts)
 
 
 def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
@@ -203,18 +203,29 @@ def check_robot_and_task(robot: Any, task: TaskConfig, program: str) -> None:
     elif needs := needs_of_task(task):
         raise ConfigError(
             f"robot.type is {robot.type!r} and task.type is {task.get_choice_name(type(task))!r}, which {program} "
-            f"simulates with {', '.join(robots_with(needs))} only. With another robot use --task.type=free: a person "
-            "says how an episode ends."
+            f"simulates with {', '.join(robots_with(needs, _excludes(TASKS.of(task))))} only. With another robot use "
+            "--task.type=free: a person says how an episode ends."
         )
 
 
 def check_task(task: TaskConfig, robot: Any) -> None:
-    """Refuse a task that needs a part that a robot does not have."""
-    if missing := needs_of_task(task) - parts_of(robot):
-        raise ConfigError(
-            f"task.type is {task.get_choice_name(type(task))!r}, which needs {_listed(missing)}; robot.type is "
-            f"{robot.type!r}, which has none. Valid: {', '.join(robots_with(needs_of_task(task))) or 'none'}."
-        )
+    """Refuse a task that needs a part that a robot does not have, or that is for robots without one that it has."""
+    needs, excludes, parts = needs_of_task(task), _excludes(TASKS.of(task)), parts_of(robot)
+    if missing := needs - parts:
+        problem = f"needs {_listed(missing)}", "which has none"
+    elif extra := excludes & parts:
+        problem = f"is for robots without {_listed(extra)}", "which has one"
+    else:
+        return
+    raise ConfigError(
+        f"task.type is {task.get_choice_name(type(task))!r}, which {problem[0]}; robot.type is {robot.type!r}, "
+        f"{problem[1]}. Valid: {', '.join(robots_with(needs, excludes)) or 'none'}. Tasks of {robot.type}: "
+        f"{', '.join(tasks_for(robot))}."
+    )
+
+
+def _excludes(kind: Any) -> Set[type]:
+    return frozenset(getattr(kind, "excludes", ()))
 
 
 def is_ours(robot_type: str) -> bool:
@@ -281,7 +292,8 @@ def brains_for(robot: Any) -> tuple[str, ...]:
 def tasks_for(robot: Any) -> tuple[str, ...]:
     """Return the names of the tasks for a robot, given its configuration or its type."""
     parts = parts_of(robot)
-    return tuple(sorted(name for name, task in TASKS.items() if set(task.needs) <= parts))
+    fitting = (name for name, task in TASKS.items() if set(task.needs) <= parts and not _excludes(task) & parts)
+    return tuple(sorted(fitting))
 
 
 def action_names_of(config: BrainConfig) -> tuple[str, ...]:

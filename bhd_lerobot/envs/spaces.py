@@ -92,5 +92,6 @@ def action_bounds(body: Body, names: tuple[str, ...]) -> tuple[NDArray[np.float6
         return np.asarray(low), np.asarray(high)
     chain = body.arm.chain
     reach, dof = chain.reach, chain.dof
-    lower, upper = limits.lower[dof:], limits.upper[dof:]
+    low, high = limits.bounds
+    lower, upper = low[dof:], high[dof:]
     return np.array([*[-reach] * 3, *[-1.0] * 4, *lower]), np.array([*[reach] * 3, *[1.0] * 4, *upper])

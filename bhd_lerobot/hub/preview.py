@@ -76,7 +76,7 @@ def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, 
         draw_trajectories(trajectories, path, what)
         return (
             path.read_bytes(),
-            f"{what}: the trajectory of {'the tool' if simulation.body.arm else 'the base'}",
+            f"{what}: the trajectory of {'the base' if simulation.body.drive else 'the tool'}",
         )
 
 

@@ -8,7 +8,7 @@ import functools
 import math
 import re
 import typing
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from numbers import Integral, Real
 from typing import Annotated, Any, ClassVar
 
@@ -139,3 +139,32 @@ def declaration_of(config_class: type, name: str) -> str:
 def _declared(kind: Any) -> list[Range | OneOf]:
     """Return what a type declares; what a plug-in annotates it with for others is not ours."""
     return [one for one in getattr(kind, "__metadata__", ()) if isinstance(one, Range | OneOf)]
+
+
+def some_of(base: Any, is_one: Callable[[Any], bool]) -> Any:
+    """Return a choice type with those choices of another that fulfil a condition.
+
+    LeRobot's command lines list the options of every choice, and those of the choices in them: what may hold itself
+    they list without an end.
+    """
+    import draccus
+
+    class Some(draccus.ChoiceRegistry):
+        lerobot_package = base.__module__
+
+        @classmethod
+        def get_known_choices(cls) -> dict[str, Any]:
+            """Return the choices by their names."""
+            return {name: choice for name, choice in base.get_known_choices().items() if is_one(choice)}
+
+        @classmethod
+        def get_choice_class(cls, name: str) -> Any:
+            """Return the choice of a name."""
+            return cls.get_known_choices()[name]
+
+        @classmethod
+        def get_choice_name(cls, subcls: type) -> str:
+            """Return the name of a choice."""
+            return str(base.get_choice_name(subcls))
+
+    return Some

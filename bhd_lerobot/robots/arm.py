@@ -1,15 +1,24 @@
 """A simulated arm as a LeRobot robot."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.robots.config_arm import ArmConfig, FileArmConfig, SO101Config
 from bhd_lerobot.robots.robot import BhdRobot
+from bhd_lerobot.tasks.fetch import FetchConfig, FetchTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+
+_TASKS: dict[str, Callable[..., Any]] = {
+    "reach": partial(ReachTask, ReachConfig()),
+    "pick": partial(PickTask, PickConfig()),
+    "fetch": partial(FetchTask, FetchConfig()),
+}
+"""What makes the tasks whose scenes a robot may be in by itself."""
 
 
 class SimulatedArm(BhdRobot):
@@ -26,16 +35,13 @@ class SimulatedArm(BhdRobot):
 
     def __init__(self, config: ArmConfig) -> None:
         super().__init__(config)
-        self._task: Any = None
-        if config.scene == "reach":
-            self._task = ReachTask(ReachConfig(), 1, config.fps, self.body)
-        elif config.scene == "pick":
-            self._task = PickTask(PickConfig(), 1, config.fps, self.body)
-        self._scene: TableScene | None = None
+        made = _TASKS.get(config.scene)
+        self._task: Any = made and made(1, config.fps, self.body)
+        self._scene: Any = None
 
-    def make_scene(self) -> TableScene:
+    def make_scene(self) -> Any:
         """Return the configured scene."""
-        scene: TableScene = super().make_scene()
+        scene = super().make_scene()
         if self._task is not None:
             self._task.begin(np.zeros(1, np.intp), [scene])
         self._scene = scene

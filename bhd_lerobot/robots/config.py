@@ -67,7 +67,14 @@ class BhdRobotConfig(RobotConfig):
         check_options(self, "robot.")
         _ = self.rates
         if self.plant == "ros2":
-            self.plant = _ROS2_PLANTS[self.body().drive is not None]
+            body: Body = self.body()
+            if body.drive is not None and body.arm is not None:
+                raise ConfigError(
+                    f"robot.plant is 'ros2', which drives a base or an arm on a table; robot.type is {self.type!r}, an "
+                    "arm on a base. Drive it by --robot.type=ros2 with a mapping of its topics, or name a class of "
+                    "your own, --robot.plant=package.module:Class."
+                )
+            self.plant = _ROS2_PLANTS[body.drive is not None]
             self.clock = "realtime"
             timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silent_s)
             brain_s = self.realtime.brain_timeout_s

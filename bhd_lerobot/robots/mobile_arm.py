@@ -1,10 +1,10 @@
 """A simulated arm on a base as a LeRobot robot."""
 
+from bhd_lerobot.robots.arm import SimulatedArm
 from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
-from bhd_lerobot.robots.robot import BhdRobot
 
 
-class SimulatedMobileArm(BhdRobot):
+class SimulatedMobileArm(SimulatedArm):
     """An arm on a base with a lidar. A subclass says its name and its configuration, which says its body.
 
     Action: the arm's, as of a `SimulatedArm`, then the base's, `x.vel` [m/s] and `theta.vel` [rad/s]. Observation: what

@@ -81,7 +81,7 @@ class AvoidTask(BaseTask):
     def __init__(self, config: AvoidConfig, n: int, fps: int, body: Body | None = None) -> None:
         super().__init__(config, n, fps, body)
         self.environment_names = TRAIL if config.trail else ()
-        if body is not None and (longest := body.limits.velocity[0] * config.duration_s) < config.min_path_m:
+        if body and body.drive and (longest := body.drive.limits.velocity[0] * config.duration_s) < config.min_path_m:
             self.notes = (
                 f"warning: no episode can succeed: in task.duration_s = {config.duration_s:g} s the robot drives "
                 f"{longest:.2g} m at the most, and task.min_path_m is {config.min_path_m:g}. Set a longer duration or "

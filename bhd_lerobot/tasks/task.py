@@ -189,6 +189,8 @@ class ConfiguredTask:
     environment_names: tuple[str, ...] = ()
     lasts = False
     needs: tuple[type, ...] = ()
+    excludes: tuple[type, ...] = ()
+    """The parts that a robot must not have for it."""
     judged_by: frozenset[str] | None = None
     notes: tuple[str, ...] = ()
     never: ClassVar[tuple[Event, ...]] = ()
@@ -247,6 +249,7 @@ class ArmTask(ConfiguredTask):
     """What the tasks of arms have in common; their scenes are `TableScene`."""
 
     needs: tuple[type, ...] = (Arm,)
+    excludes = (Drive,)  # it is told where things are in the world frame, which is that of an arm that stands
 
     @cached_property
     def arm(self) -> Arm:

@@ -29,7 +29,7 @@ class GoalStreamer:
     Args:
         body: the robot, with an arm.
         rates: the rates.
-        start: where the arm's reference is now, joint angles [rad] and the gripper's opening [m], shape (7,).
+        start: the robot's command now, joint angles [rad] and the gripper's opening [m] first, shape (width,).
     """
 
     def __init__(self, body: Body, rates: Rates, start: NDArray[np.float64]) -> None:
@@ -37,7 +37,7 @@ class GoalStreamer:
         with never_compiled():  # LeRobot's loop has begun
             self._controller = ArmController(body, 1, rates.control_hz, rates.ticks_per_frame)
         self._reading = PlantReading(1, self._controller.joints, states=self._controller.states)
-        self._reading.position[0] = start
+        self._reading.position[0] = start[: self._controller.joints]
         self._controller.configure(np.zeros(1, np.intp), self._reading)
 
     def frame(
@@ -47,15 +47,16 @@ class GoalStreamer:
 
         Args:
             commands: new goals.
-            measured: where the joints are now, shape (7,).
+            measured: where the joints are now, those of the arm first, shape (joints,).
 
         Returns:
-            The reference at the end of the frame, shape (7,), and the goals that ended or were refused.
+            The arm's reference at the end of the frame, shape (joints of the arm,), and the goals that ended or were
+            refused.
         """
         controller, reading = self._controller, self._reading
         refused = [refusal for command in commands if (refusal := controller.submit(0, command)) is not None]
         # Within the frame nothing is measured: the arm is taken to follow the reference from where it is.
-        behind = measured - controller.command[0]
+        behind = measured[: controller.joints] - controller.command[0]
         for _ in range(self._rates.ticks_per_frame):
             reading.velocity[0] = controller.velocity[0]
             reading.position[0] = controller.command[0] + behind
@@ -147,7 +148,7 @@ class BhdBrain(Teleoperator):
         robot = self._find_robot()
         if robot is not self._robot or self._brain is None:
             if not drives(self.config.brain, robot.config):
-                is_arm = robot.host.body.arm is not None
+                is_arm = robot.host.body.arm is not None and robot.host.body.drive is None
                 example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
                 raise ConfigError(
                     f"The brain {self._brain_name!r} does not drive a {robot.name}. Choose one that does by "
@@ -189,11 +190,16 @@ class BhdBrain(Teleoperator):
                 f"The brain {self._brain_name!r} gives goals; {robot} takes none. Use an arm with "
                 "robot.control = servo."
             )
+        if goals.setpoints is not None and 0 in goals.streamed:
+            self._streamer = None  # the next goal begins where this leads to
+            return goals.setpoints[0], []
+        state = robot.host.bridge.state()
         if self._streamer is None:
-            self._streamer = GoalStreamer(body, rates, robot.host.bridge.state().command[0])
-        reading = robot.host.bridge.state()
-        reference, results = self._streamer.frame(goals.commands.get(0, ()), reading.joint_positions[0])
-        return robot.host.to_action(reference[None])[0], results
+            self._streamer = GoalStreamer(body, rates, state.command[0])
+        reference, results = self._streamer.frame(goals.commands.get(0, ()), state.joint_positions[0])
+        command = np.zeros((1, len(body.limits.names)))  # a base stands meanwhile
+        command[0, : len(reference)] = reference
+        return robot.host.to_action(command)[0], results
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Do nothing: a brain feels no feedback."""

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from bhd_lerobot.apps.doctor.identify import excite, for_identification, identify, servo_option, servo_table
 from bhd_lerobot.bodies.body import Arm, Body
+from bhd_lerobot.bodies.registry import BODIES, parts_of_type
 from bhd_lerobot.control.geometry.capsules import left_out
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.errors import ConfigError, RenderingError
@@ -44,7 +45,7 @@ def describe_robot(config: RobotDescription, console: Console) -> None:
     """
     made: Any = config.robot
     if not hasattr(made, "body") or (body := made.body()).arm is None:
-        raise ConfigError(f"robot.type is {made.type!r}; bhd-doctor describes arms: arm, so101, ur5.")
+        raise ConfigError(f"robot.type is {made.type!r}; bhd-doctor describes arms: {', '.join(sorted(name for name in BODIES if Arm in parts_of_type(name)))}.")
     if config.identify:
         _identify(made, console)
         return
@@ -110,7 +111,20 @@ def _facts(body: Body, arm: Arm) -> dict[str, str]:
         "workspace": f"tool within {low} … {high} m; objects within {left} … {right} m",
         "collisions": f"{len(chain.capsules)} capsules, {len(chain.disjoint)} pairs, {chain.min_distance} m apart",
         "pairs left out": f"{len(without)}: {', '.join(without)}" if without else "none but those of neighbours",
+        **_base(body),
         "rates": f"physics at {body.least_physics_hz} Hz or more, control at {body.least_control_hz} Hz or more",
+    }
+
+
+def _base(body: Body) -> dict[str, str]:
+    """Return what is known of the base that an arm is on."""
+    if (drive := body.drive) is None or (lidar := body.lidar) is None:
+        return {}
+    forward, turn = drive.limits.velocity
+    wheels = f"wheels of {drive.wheel_radius:g} m, {drive.wheel_separation:g} m apart"
+    return {
+        "base": f"up to {forward:g} m/s and {turn:g} rad/s, radius {drive.radius:g} m; {wheels}",
+        "lidar": f"{lidar.beams} beams, {lidar.range_min:g} to {lidar.range_max:g} m, {lidar.rate_hz} Hz",
     }
 
 
@@ -123,11 +137,12 @@ def _draw(body: Body, picture: Path) -> None:
 
     world = World(body)
     # The camera is made for arms that reach as far as a UR5.
-    world.model_field("cam_fovy")[:, world.model.camera("overview").id] *= min(1.0, body.need(Arm).chain.reach)
+    view = "overview" if body.drive is None else "follow"
+    world.model_field("cam_fovy")[:, world.model.camera(view).id] *= min(1.0, body.need(Arm).chain.reach)
     camera = Camera(world, *_SIZE)
     try:
         picture.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(camera.render(0, "overview")).save(picture)
+        Image.fromarray(camera.render(0, view)).save(picture)
     except (OSError, ValueError) as error:
         raise ConfigError(
             f"picture is {str(picture)!r}, which cannot be written: {error}. Name a .png file."

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Body, LidarSpec
+from bhd_lerobot.bodies.body import Arm, Body, Drive, LidarSpec
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures, find_columns, find_scan
@@ -83,9 +83,11 @@ class StallWatch:
     def __init__(self, frames: int, robot: RobotFeatures) -> None:
         self._window, self._dt = frames + 1, 1.0 / robot.fps
         self._is_base = robot.body is not None and robot.body.drive is not None
-        names = _TWIST if self._is_base else _joints_of(robot)
-        self._width = 2 if self._is_base else len(names)
+        has_arm = not self._is_base or (robot.body is not None and robot.body.arm is not None)
+        names = (*(_joints_of(robot) if has_arm else ()), *(_TWIST if self._is_base else ()))
         self._columns = find_columns(robot.observation_names, names, "dagger", "observation")
+        self._least = np.full(len(names), _STALL_RAD)  # of a base x and y are watched
+        self._least[len(names) - 2 * self._is_base :] = _STALL_M / math.sqrt(2)
         self._pose: Array = np.zeros((0, 3))
         self._past: Array = np.zeros((0, 0, 0))
         self._frames = np.zeros(0, np.int64)
@@ -94,22 +96,22 @@ class StallWatch:
         """Begin the learner's turn."""
         if len(self._frames) != n:
             self._frames, self._pose = np.zeros(n, np.int64), np.zeros((n, 3))
-            self._past = np.zeros((n, self._window, self._width))
+            self._past = np.zeros((n, self._window, len(self._least)))
         self._frames[ids] = 0
 
     def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
         """Compare where the robot was within the window."""
         values = seen.state[:, self._columns]
         if self._is_base:
-            self._pose[:, 2] += values[:, 1] * self._dt
-            step = values[:, 0] * self._dt
+            self._pose[:, 2] += values[:, -1] * self._dt
+            step = values[:, -2] * self._dt
             self._pose[:, 0] += step * np.cos(self._pose[:, 2])
             self._pose[:, 1] += step * np.sin(self._pose[:, 2])
-            values = self._pose[:, :2]
+            values[:, -2:] = self._pose[:, :2]
         self._past[np.arange(len(values)), self._frames % self._window] = values
         self._frames += 1
         span = self._past.max(axis=1) - self._past.min(axis=1)
-        still = span.max(axis=1) < (_STALL_M / math.sqrt(2) if self._is_base else _STALL_RAD)
+        still = (span < self._least).all(axis=1)
         return np.asarray((self._frames >= self._window) & still)
 
 
@@ -146,7 +148,7 @@ class BaseCollisionWatch(Watch):
     def __init__(self, horizon_s: float, robot: RobotFeatures, body: Body) -> None:
         self._scan, self._angles = find_scan(robot.observation_names, "dagger")
         self._twist = find_columns(robot.action_names, _TWIST, "dagger", "action")
-        self._limit = np.array(body.limits.velocity)
+        self._limit = np.array(body.need(Drive).limits.velocity)
         self._footprint, self._no_return = Footprint.of(body), body.need(LidarSpec).range_max - _ROUNDING
         self._times = horizon_s * np.arange(1, _ARC_POINTS + 1) / _ARC_POINTS
 
@@ -211,13 +213,32 @@ class ArmCollisionWatch(Watch):
         return np.asarray(near.any(axis=0) & ~(near[0] & leaves))
 
 
+class BothWatch(Watch):
+    """Either of two things that are about to happen."""
+
+    cause = "about to collide"
+
+    def __init__(self, one: Watch, other: Watch) -> None:
+        self._both = one, other
+
+    def check(self, seen: Observation, wanted: Array, advised: Array) -> Mask:
+        """Return where one of them is."""
+        one, other = (watch.check(seen, wanted, advised) for watch in self._both)
+        return one | other
+
+
 def collision_watch(horizon_s: float, robot: RobotFeatures) -> Watch:
     """Return what watches a robot for collisions."""
     body = robot.body
+    base = arm = None
     if body is not None and body.drive is not None and body.lidar is not None:
-        return BaseCollisionWatch(horizon_s, robot, body)
+        base = BaseCollisionWatch(horizon_s, robot, body)
     if body is not None and body.arm is not None:
-        return ArmCollisionWatch(robot, body.arm)
+        arm = ArmCollisionWatch(robot, body.arm)
+    if base and arm:
+        return BothWatch(base, arm)
+    if one := base or arm:
+        return one
     raise ConfigError(
         "brain.collision_s foresees collisions of simulated arms and of simulated bases with a lidar, not of a robot "
         f"with the actions {', '.join(robot.action_names)}. Leave it out: --brain.collision_s=null."

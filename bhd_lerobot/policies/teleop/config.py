@@ -3,41 +3,18 @@
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import draccus
 from lerobot.teleoperators.config import TeleoperatorConfig
 
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.declared import Positive
+from bhd_lerobot.options.declared import Positive, some_of
 from bhd_lerobot.policies.brain import BrainConfig
 
 if TYPE_CHECKING:
     from lerobot.teleoperators.config import TeleoperatorConfig as PersonConfig
 else:
-
-    class PersonConfig(draccus.ChoiceRegistry):
-        """The configurations of teleoperators that a person holds.
-
-        LeRobot's command lines list the options of every choice, and those of the choices in them: a brain that may
-        hold the teleoperator `bhd_brain`, which holds a brain, would hold itself, without an end.
-        """
-
-        lerobot_package = "lerobot.teleoperators"
-
-        @classmethod
-        def get_known_choices(cls) -> dict[str, Any]:
-            """Return the teleoperators by their types."""
-            known = TeleoperatorConfig.get_known_choices()
-            return {name: choice for name, choice in known.items() if name != "bhd_brain"}
-
-        @classmethod
-        def get_choice_class(cls, name: str) -> Any:
-            """Return the configuration of the teleoperator of this type."""
-            return cls.get_known_choices()[name]
-
-        @classmethod
-        def get_choice_name(cls, subcls: type) -> str:
-            """Return the type of the teleoperator that a configuration is of."""
-            return TeleoperatorConfig.get_choice_name(subcls)
+    # Not `bhd_brain`, which holds a brain.
+    PersonConfig = some_of(TeleoperatorConfig, lambda choice: choice.__name__ != "BhdBrainConfig")
+    """The configurations of teleoperators that a person holds."""
 
 
 @BrainConfig.register_subclass("teleop")

@@ -11,14 +11,21 @@ import numpy as np
 from lerobot.robots.config import RobotConfig
 from rich.console import Console
 
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Options, Range
 from bhd_lerobot.robots.config import BhdRobotConfig
+from bhd_lerobot.robots.config_mobile_arm import MobileArmConfig
 from bhd_lerobot.robots.host.realtime import LiveHost, make_live
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.viewer.viewer import viewed
 from bhd_lerobot.ros2.live.network import NetworkConfig, require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.serve.server import Counts, Server, Topics
+
+
+def is_served(kind: type) -> bool:
+    """Return whether robots of a configuration have topics of their own: a base has, and an arm on a table."""
+    return issubclass(kind, BhdRobotConfig) and not issubclass(kind, MobileArmConfig)
 
 
 @dataclass
@@ -35,7 +42,7 @@ class ServiceConfig(Options):
             messages (`package.xml` and `msg/`), whose fields are found by their names.
     """
 
-    taken: ClassVar = {"robot": BhdRobotConfig}  # of all types that there are
+    taken: ClassVar = {"robot": is_served}  # of all types that there are
 
     robot: RobotConfig
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -43,6 +50,14 @@ class ServiceConfig(Options):
     state_hz: Annotated[float, Range("(0, 1000]")] = 50.0
     duration_s: NotNegative = 0.0
     articles: bool | str = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.robot, MobileArmConfig):
+            raise ConfigError(
+                f"robot.type is {self.robot.type!r}, an arm on a base, for which bhd-ros2 has no topics. Valid: a base "
+                "or an arm on a table, such as turtlebot3 or ur5."
+            )
 
 
 def run_service(
