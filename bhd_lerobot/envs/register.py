@@ -18,6 +18,7 @@ ENVIRONMENTS = Registry(
         "TurtleBot3Navigate-v0": ("turtlebot3", "navigate"),
         "UR5Reach-v0": ("ur5", "reach"),
         "UR5Pick-v0": ("ur5", "pick"),
+        "TurtleBot3ManipulationFetch-v0": ("turtlebot3_manipulation", "fetch"),
     },
 )
 """The types of the robot and of the task of each environment."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.envs.register import ENVIRONMENTS
 
@@ -15,7 +16,7 @@ def short(name: str, **overrides: Any) -> dict[str, Any]:
     if name.startswith("UR5"):
         return {"task": {"duration_s": 1.0, "randomisation": {"enabled": True}}, **overrides}
     hold = {"hold_s": 0.5} if "Navigate" in name else {}
-    return {"robot": {"beams": 36}, "task": {"duration_s": 2.0, **hold}, **overrides}
+    return {"robot": {"beams": 36}, "task": {"duration_s": 0.8 if "Manipulation" in name else 2.0, **hold}, **overrides}
 
 
 def some_actions(name: str, frames: int, n: int = 1, seed: int = 0) -> np.ndarray:
@@ -25,7 +26,8 @@ def some_actions(name: str, frames: int, n: int = 1, seed: int = 0) -> np.ndarra
         home = np.array(ur5().arm.home)
         actions = home + rng.uniform(-0.2, 0.2, (frames, n, len(home)))
     else:
-        actions = np.array([0.22, 0.0]) + rng.uniform(-0.2, 0.2, (frames, n, 2))
+        held = turtlebot3_manipulation().arm.home if "Manipulation" in name else ()
+        actions = np.array([*held, 0.22, 0.0]) + rng.uniform(-0.2, 0.2, (frames, n, len(held) + 2))
     return actions.astype(np.float32)
 
 

@@ -268,6 +268,10 @@ def test_a_camera_is_recorded_frame_by_frame(tmp_path):
             "Brains for it: blanked, dagger, language, learned, noop, pick, pick_servo, random, reach, reach_servo",
         ),
         ({**ARM, "brain__type": "reach"}, "target_x"),
+        (
+            {**ARM, "robot__type": "turtlebot3_manipulation", "task__type": "reach", "brain__type": "reach"},
+            "without a drive; .* Valid: arm, so101, ur5. Tasks of turtlebot3_manipulation: avoid, fetch",
+        ),
         ({**ARM, "task__max_objects": 6}, "max_objects is 6"),
         ({**ARM, "task__randomisation__size": 1.5}, "randomisation.size is 1.5"),
         ({**ARM, "robot__action_space": "joints"}, "Did you mean 'joint'"),

@@ -8,6 +8,7 @@ import pytest
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur5 import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
@@ -85,20 +86,27 @@ def record_and_replay(robot: str, fps: int, *options: str) -> None:
 
 
 def test_stock_record_and_replay_work(tmp_path, monkeypatch):
-    """`lerobot-record` and `lerobot-replay` of both robots, in processes of their own: they end with these."""
+    """`lerobot-record` and `lerobot-replay` of the robots, in processes of their own: they end with these."""
     monkeypatch.chdir(tmp_path)
     outputs = []
-    for options in (("turtlebot3", 10), ("ur5", 25, "--robot.scene=pick", "--teleop.brain.type=pick")):
+    for options in (
+        ("turtlebot3", 10),
+        ("ur5", 25, "--robot.scene=pick", "--teleop.brain.type=pick"),
+        ("turtlebot3_manipulation", 25, "--robot.scene=fetch", "--teleop.brain.type=fetch"),
+    ):
         log = tmp_path / "log"
         status = Fork(record_and_replay, *options, output=log).wait()
         outputs.append(log.read_text())
         assert status == 0, outputs[-1]
     lines = "".join(outputs).splitlines()
     recorded = [line.split(" ", 3) for line in lines if line.startswith("RECORDED")]
-    assert [int(width) for _, _, width, _ in recorded] == [362, 14]
-    for (_, frames, _, _), fps in zip(recorded, (10, 25), strict=True):
+    assert [int(width) for _, _, width, _ in recorded] == [362, 14, 372]
+    for (_, frames, _, _), fps in zip(recorded, (10, 25, 25), strict=True):
         assert 5 <= int(frames) <= fps + 1
-    base, arm = (json.loads(action) for *_, action in recorded)
+    base, arm, mobile = (json.loads(action) for *_, action in recorded)
     assert np.allclose(base, [0.2, 0.0])
     assert not np.allclose(arm, UR5Config().body().arm.home, atol=0.05)  # it was on its way
-    assert lines.count("REPLAYED") == 2
+    *held, _, turn = mobile
+    assert np.allclose(held, TurtleBot3ManipulationConfig().body().arm.home, atol=0.01)
+    assert turn  # it drives, or turns to where it will
+    assert lines.count("REPLAYED") == 3

@@ -45,7 +45,8 @@ def describe_robot(config: RobotDescription, console: Console) -> None:
     """
     made: Any = config.robot
     if not hasattr(made, "body") or (body := made.body()).arm is None:
-        raise ConfigError(f"robot.type is {made.type!r}; bhd-doctor describes arms: {', '.join(sorted(name for name in BODIES if Arm in parts_of_type(name)))}.")
+        arms = ", ".join(sorted(name for name in BODIES if Arm in parts_of_type(name)))
+        raise ConfigError(f"robot.type is {made.type!r}; bhd-doctor describes arms: {arms}.")
     if config.identify:
         _identify(made, console)
         return

@@ -157,6 +157,8 @@ def test_brains_are_looked_for_where_the_robot_is_but_for_what_is_given() -> Non
         (["--robot.type=ur5"], "robot.plant is not given; a bridge is in front of a robot"),
         (["--robot.type=ur5", "--robot.plant=ros2", "--robot.action_space=tool"], "robot.action_space is 'tool'"),
         (["--robot.type=so101_follower", "--robot.port=x"], "robot.plant is not given"),
+        (["--robot.type=turtlebot3_manipulation"], "an arm on a base, for which bhd-ros2 has no topics"),
+        (["--robot.type=turtlebot3_manipulation", "--robot.plant=ros2"], "which drives a base or an arm on a table"),
     ],
 )
 def test_a_bridge_in_front_of_nothing_is_refused(options, error, capsys):
