@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -57,8 +58,9 @@ def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
         ranges = limits_of(name)["control.applied_action"]
         assert list(ranges) == list(limits.names)
         for index, (low, high) in enumerate(ranges.values()):
-            assert high == (limits.upper if body.arm else limits.velocity)[index]
-            assert low == (limits.lower[index] if body.arm else -high)
+            is_speed = np.isinf(limits.upper[index])
+            assert high == (limits.velocity if is_speed else limits.upper)[index]
+            assert low == (-high if is_speed else limits.lower[index])
     assert limits_of("turtlebot3")["control.applied_action"]["x.vel"] == (-0.22, 0.22)
     assert limits_of("ur5")["observation.state"]["gripper.pos"] == (0.0, 0.085)
     assert limits_of("so101_follower") == limits_of(None) == {}
