@@ -42,6 +42,7 @@ class TeleopBrain(ConfiguredBrain):
         self._calls: Calls | None = None
         self._map: Callable[[Mapping[str, Any]], dict[str, float] | None] = dict
         self._robot: RobotFeatures | None = None
+        self._held: dict[str, float] = {}  # actions of a part that the teleoperator gives nothing of
         self._is_starting = True
         self._answered_s = 0.0
         self._wait_s = 0.0
@@ -73,7 +74,10 @@ class TeleopBrain(ConfiguredBrain):
             asked = flattened(self.config.map)
             drive = robot.body.drive if robot.body else None
             pair = Pair(teleop_type, robot.robot_type, is_ours[0] == is_ours[1], drive)
-            self._map = ActionMap(asked, pair, features, robot.action_names)
+            known = (*asked, *pair.shares, *(features if pair.same_project else ()))
+            self._held = dict.fromkeys(_held(robot, known), 0.0)
+            driven = [name for name in robot.action_names if name not in self._held]
+            self._map = ActionMap(asked, pair, features, driven)
             if not asked:
                 self._check_units(robot)
         self._calls = self._calls or Calls(f"bhd-{teleop_type}")
@@ -110,11 +114,7 @@ class TeleopBrain(ConfiguredBrain):
         seen = dict(zip(observation.names, observation.state[0].tolist(), strict=True))
         teleop_type = self.config.teleop.type
         try:
-            if isinstance(self.teleop, StartsFromObservation):
-                if self._is_starting:
-                    self.teleop.start_from(seen, self._robot.body)
-                self.teleop.observe(seen)
-            self._is_starting = False
+            self._show(seen)
             has_answered, given = self._calls.call(self.teleop.get_action, self._wait_s)
             silent = time.monotonic() - self._answered_s
             if not has_answered:
@@ -132,6 +132,7 @@ class TeleopBrain(ConfiguredBrain):
             raise BrainStoppedError(f"the teleoperator {teleop_type} failed: {as_text(error)}") from error
         if action is None:
             return None
+        action |= self._held
         processor, values = f"the processor {self.config.processor}", []
         for name in self._robot.action_names:
             if name not in action:
@@ -142,6 +143,16 @@ class TeleopBrain(ConfiguredBrain):
                 what = f"{processor} returned {action[name]!r} for {name!r}, which is not a number"
                 raise BrainStoppedError(what) from None
         return np.array([values])
+
+    def _show(self, seen: dict[str, float]) -> None:
+        """Take what is observed: what is held at the start, and what the teleoperator starts from."""
+        if self._is_starting:
+            self._held = {name: 0.0 if name.endswith(".vel") else seen[name] for name in self._held}
+        if isinstance(self.teleop, StartsFromObservation):
+            if self._is_starting:
+                self.teleop.start_from(seen, self._robot.body if self._robot else None)
+            self.teleop.observe(seen)
+        self._is_starting = False
 
     def parameters(self) -> dict[str, Any]:
         """Return the type of the teleoperator and how its actions are used; not where it is connected."""
@@ -164,6 +175,18 @@ class TeleopBrain(ConfiguredBrain):
             except Exception as error:  # of another package's code: what was recorded is reported all the same
                 kind = self.config.teleop.type
                 print(f"warning: the teleoperator {kind} could not be disconnected: {as_text(error)}", file=sys.stderr)
+
+
+def _held(robot: RobotFeatures, known: Sequence[str]) -> list[str]:
+    """Return the actions of the arm, or of the base that it is on, of none of which it is known where it comes from."""
+    body = robot.body
+    if body is None or body.arm is None or body.drive is None:
+        return []
+    base = [name for name in robot.action_names if name in body.drive.limits.names]
+    arm = [name for name in robot.action_names if name not in base]
+    if set(arm) <= set(robot.observation_names) and not set(known) & set(arm):
+        return arm
+    return [] if set(known) & set(base) else base
 
 
 def _made(config: Any) -> Any:

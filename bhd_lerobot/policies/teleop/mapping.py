@@ -41,6 +41,11 @@ class Pair:
     same_project: bool
     drive: Drive | None = None
 
+    @property
+    def shares(self) -> Mapping[str, str]:
+        """The actions that the teleoperator gives as shares of a base's largest speeds, and what it calls them."""
+        return _SHARES.get(self.teleop, {}) if self.drive is not None else {}
+
 
 class ActionMap:
     """Turns a teleoperator's actions into a robot's.
@@ -58,8 +63,8 @@ class ActionMap:
     def __init__(self, asked: Mapping[str, Any], pair: Pair, features: Sequence[str], actions: Sequence[str]) -> None:
         if wrong := [name for name in asked if name not in actions]:
             raise ConfigError(unknown_name("action of --map", wrong[0], actions))
-        shares = _SHARES.get(pair.teleop, {}) if pair.drive is not None else {}
-        largest = dict(zip(pair.drive.limits.names, pair.drive.limits.velocity, strict=True)) if pair.drive else {}
+        drive, shares = pair.drive, pair.shares
+        largest = dict(zip(drive.limits.names, drive.limits.velocity, strict=True)) if drive else {}
         self._sources: dict[str, Source] = {}
         for action in actions:
             if action in asked:

@@ -3,11 +3,14 @@
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Drive
+from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.errors import BrainStoppedError, ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
@@ -73,3 +76,19 @@ def test_a_processor_that_returns_no_number_ends_the_episode(brain: TeleopBrain,
     brain._map = dict
     with pytest.raises(BrainStoppedError, match=r"the processor .* for .shoulder.pos., which is not a number"):
         brain.act(SEEN)
+
+
+@pytest.mark.parametrize("part", ["arm", "base"])
+def test_of_an_arm_on_a_base_the_part_that_a_teleoperator_does_not_give_is_held(part: str) -> None:
+    body = turtlebot3_manipulation()
+    names, speeds = body.limits.names, body.need(Drive).limits.names
+    driven = speeds if part == "base" else names[: -len(speeds)]
+    seen = Observation(names, np.arange(1.0, 1.0 + len(names))[None])
+    asked = {name: {"from": JOINTS[0], "scale": 0.0, "offset": 9.0} for name in driven}
+    with closing(TeleopBrain(TeleopConfig(MockLeaderConfig(), map=asked))) as brain:
+        brain.bind(RobotFeatures(names, names, 25, body=body, robot_type=body.name))
+        brain.reset(ONLY, [0], 1)
+        actions = [brain.act(replace(seen, state=seen.state + late)) for late in (0.0, 1.0)]
+    held = {name: 0.0 if name in speeds else value for name, value in zip(names, seen.state[0], strict=True)}
+    for action in actions:
+        assert action.tolist() == [[9.0 if name in driven else held[name] for name in names]]  # type: ignore[union-attr]
