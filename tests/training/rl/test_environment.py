@@ -115,7 +115,7 @@ def test_an_episode_whose_time_is_over_is_truncated_and_the_next_begins_in_the_s
 
 def collide(rig: Rig) -> tuple:
     rig.adapter.reset()
-    rig.env.episodes.simulation._touched[0] = False
+    rig.env.episodes.simulation.touches[0][0] = False
     for _ in range(400):
         features, reward, done, infos = rig.step(forward=1.0)
         hits = [sim for sim, info in enumerate(infos) if info.get("event") == "collision"]
