@@ -36,7 +36,7 @@ def _parser() -> Parser:
 def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) -> int:
     """Run `bhd-doctor`; return the exit status: 0, 1 if there is a problem, 2 for wrong options."""
     given = sys.argv[1:] if arguments is None else arguments
-    if any(one.startswith("--robot.") for one in given):
+    if any(one.startswith(("--robot", "--identify", "--picture")) for one in given):
         given = ["--identify=true" if one == "--identify" else one for one in given]
         import bhd_lerobot.registry  # noqa: F401  registers the robots
         from bhd_lerobot.apps.doctor.robot import RobotDescription, describe_robot

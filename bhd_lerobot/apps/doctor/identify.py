@@ -63,8 +63,11 @@ class ServoModel:
 
 def for_identification(config: Any) -> Any:
     """Return the configuration of an arm that is commanded joint by joint, as often as its control rate allows."""
-    if not hasattr(config, "action_space") or config.control != "servo":
-        raise ConfigError(f"robot.type is {config.type!r}; the servos of arms with robot.control=servo are identified.")
+    if not hasattr(config, "measured"):
+        raise ConfigError(
+            f"robot.type is {config.type!r}, whose servos are known; those of arms from a file are identified: choose "
+            "so101, or arm with --robot.mjcf=FILE."
+        )
     fps = max(fps for fps in range(1, _FPS + 1) if config.control_hz % fps == 0)
     return replace(config, fps=fps, action_space="joint")
 

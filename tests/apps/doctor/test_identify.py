@@ -84,6 +84,19 @@ def test_the_servos_of_a_ur5_are_known() -> None:
         UR5Config(servos={"elbow": [1.0, 1.0, 0.0]})
 
 
-def test_a_base_has_no_servos_to_identify(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--identify", "--robot.type=turtlebot3"]) == 2
-    assert "bhd-doctor describes arms" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("robot", "message"),
+    [
+        (["--robot.type=turtlebot3"], "bhd-doctor describes arms"),
+        (["--robot.type=ur5"], "whose servos are known"),
+        (["--robot.type=turtlebot3_manipulation"], "whose servos are known"),
+        ([], "robot"),
+    ],
+)
+def test_where_there_are_no_servos_to_identify_that_is_said(
+    robot: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--identify", *robot]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert "Unknown option" not in said
