@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.ur5 import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
@@ -47,9 +48,11 @@ class PerfectArm(Plant):
 
 class Rig:
     def __init__(self, n: int = 1, active: bool = True, planning: Any = None) -> None:
-        self.n, self.plant = n, PerfectArm(n)
-        self.controller = ArmController(ARM, n, HZ, FRAME, planning)
-        self.cerebellum = Cerebellum(ARM, self.plant, HZ, controller=self.controller)
+        self._start(ARM, PerfectArm(n), ArmController(ARM, n, HZ, FRAME, planning), active)
+
+    def _start(self, body: Body, plant: Any, controller: Any, active: bool, sensors: int = 0) -> None:
+        self.n, self.plant, self.controller = plant.n, plant, controller
+        self.cerebellum = Cerebellum(body, plant, HZ, controller, sensors=sensors)
         self.now, self.sequence, self.names = 0, 0, 0
         self.rows = [self.cerebellum.command.copy()]
         self.modes: list[list[int]] = []
@@ -96,7 +99,7 @@ class Rig:
         return [(one.task_id, one.code) for one in self.controller.take_results(sim)]
 
     def until(self, mode: Mode, most: int = 3000) -> int:
-        """Tick until an arm is in a mode; return how many ticks it took."""
+        """Tick until the first robot is in a mode; return how many ticks it took."""
         for ticks in range(most):
             if self.mode == mode:
                 return ticks

@@ -8,16 +8,13 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.mobile import MobileArmController
-from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode
 from bhd_lerobot.control.drive import BaseController
-from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, SendResult, Setpoint
 from bhd_lerobot.control.plant import Plant, PlantReading
+from tests.control import arm_rig
+from tests.control.arm_rig import FRAME, HZ
 
 Array = NDArray[np.float64]
 
-HZ, FRAME = 500, 20
-TICK_NS = NANOSECONDS // HZ
 BODY = turtlebot3_manipulation()
 ARM, WHEELS = slice(0, 5), slice(5, 7)  # of commands, joints and actuators
 HOME = np.array([*BODY.arm.home, 0.0, 0.0])  # type: ignore[union-attr]
@@ -69,60 +66,18 @@ class PerfectMobileArm(Plant):
         self.position = self.position + self.velocity / HZ
 
 
-class Rig:
+class Rig(arm_rig.Rig):
     def __init__(self, n: int = 1, active: bool = True, plant: Any = None, **drive: Any) -> None:
-        self.n, self.plant = n, PerfectMobileArm(n) if plant is None else plant
         arm = ArmController(BODY, n, HZ, FRAME)
-        base = BaseController(DRIVE, n, HZ, arm=arm, **drive)
-        self.controller = MobileArmController(arm, base)
+        controller = MobileArmController(arm, BaseController(DRIVE, n, HZ, arm=arm, **drive))
         sensors = 0 if drive.get("gyro") is None else drive["gyro"] + 1
-        self.cerebellum = Cerebellum(BODY, self.plant, HZ, self.controller, sensors=sensors)
-        self.now, self.sequence, self.names = 0, 0, 0
-        if active:
-            assert self.request(Request.CONFIGURE).accepted.all()
-            assert self.request(Request.ACTIVATE).accepted.all()
-
-    def request(self, request: Request) -> SendResult:
-        return self.cerebellum.request(request)
-
-    def tick(self, ticks: int = 1) -> None:
-        for _ in range(ticks):
-            self.cerebellum.tick(self.now)
-            self.now += TICK_NS
-
-    def send(self, values: Array, mask: NDArray[np.bool_] | None = None) -> SendResult:
-        self.sequence += 1
-        return self.cerebellum.offer(Setpoint(self.sequence, self.now, np.broadcast_to(values, (self.n, 7))), mask)
+        self._start(BODY, PerfectMobileArm(n) if plant is None else plant, controller, active, sensors)
 
     def push(self, values: Array, due: int | None = None) -> None:
         """Send what no sender of ours sends."""
         self.sequence += 1
         rows = np.broadcast_to(np.asarray(values, np.float64), (self.n, 7))
         self.cerebellum.fifo.push(self.sequence, self.now if due is None else due, rows, np.ones(self.n, np.bool_))
-
-    def stream(self, values: Array, frames: int) -> None:
-        for _ in range(frames):
-            assert self.send(values).accepted.all()
-            self.tick(FRAME)
-
-    def go(self, sim: int = 0, **fields: Any) -> CommandResult | None:
-        self.names += 1
-        return self.cerebellum.submit(sim, BrainCommand(str(self.names), **fields))
-
-    def results(self, sim: int = 0) -> list[tuple[str, ResultCode]]:
-        return [(one.task_id, one.code) for one in self.controller.take_results(sim)]
-
-    def until(self, mode: Mode, most: int = 3000) -> int:
-        """Tick until the first robot is in a mode; return how many ticks it took."""
-        for ticks in range(most):
-            if self.mode == mode:
-                return ticks
-            self.tick()
-        raise AssertionError(f"still {self.mode!r}")
-
-    @property
-    def mode(self) -> Mode:
-        return Mode(int(self.cerebellum.mode[0]))
 
     @property
     def twist(self) -> list[float]:

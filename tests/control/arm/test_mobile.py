@@ -10,14 +10,12 @@ import pytest
 from bhd_lerobot.control.arm.step import Stage
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Request, Setpoint, Watchdog
+from tests.control.arm_rig import FRAME, HZ, TICK_NS
 from tests.control.mobile_rig import (
     ARM,
     DRIVE,
-    FRAME,
     HOME,
-    HZ,
     SWEEP,
-    TICK_NS,
     TIMEOUT_TICKS,
     WHEELS,
     Rig,
