@@ -89,6 +89,7 @@ class FetchBrain(GoalBrain):
         self._steps: dict[int, _Steps] = {}
         self._views: dict[int, _View] = {}
         self._problems: dict[int, str] = {}
+        self._above: dict[int, float] = {}  # the tool over the middle of the object that it has taken [m]
         self._rows: dict[int, NDArray[np.float64]] = {}  # the setpoint that holds the arm while the base drives
         self._to: NDArray[np.int64] = np.zeros(0, np.int64)  # where the navigator drives; -1 for nowhere
         self._twists: NDArray[np.float64] = np.zeros((0, 2))
@@ -242,7 +243,7 @@ class FetchBrain(GoalBrain):
         across = abs(math.cos(thing.yaw - self._yaw(tool))) >= math.sqrt(0.5)
         width = thing.size[1 if across and thing.kind == "box" else 0]
         closed = max(0.0, width - SQUEEZE)
-        self._above = tool[2] - z  # of the tool over the middle of the object
+        self._above[sim] = float(tool[2] - z)
         lifted = np.add(tool, (0.0, 0.0, self.config.lift_m))
         for command in (
             {"target_pose": self._ahead(tool, -_FROM), "gripper": self._gripper.max_opening},
@@ -268,7 +269,7 @@ class FetchBrain(GoalBrain):
         self.doing[sim] = "lay it down"
         view = self._views[sim]
         x, y, top = view.spots[_PLACE]
-        tool = np.array((x, y, top + view.thing.size[2] / 2 + self._above + _RELEASE))
+        tool = np.array((x, y, top + view.thing.size[2] / 2 + self._above[sim] + _RELEASE))
         over = np.add(tool, (0.0, 0.0, self.config.lift_m))
         for command in (
             {"target_pose": self._ahead(over, -_FROM)},

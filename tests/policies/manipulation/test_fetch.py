@@ -24,6 +24,7 @@ from bhd_lerobot.tasks.task import Event, episode_seed
 BODY, FPS, EPISODES = turtlebot3_manipulation(), 20, 6
 NAMES = (*BODY.arm.limits.names, "x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(360)))
 FEATURES = RobotFeatures(NAMES, BODY.limits.names, FPS, ENVIRONMENT, BODY)
+SPECS = [EpisodeSpec(number, episode_seed(7, number, "held_out")) for number in range(EPISODES)]
 HOME = (*BODY.arm.home, 0.0, 0.0)
 
 
@@ -32,8 +33,7 @@ def test_it_fetches_what_it_was_never_tuned_on() -> None:
     config = TurtleBot3ManipulationConfig()
     task = FetchTask(FetchConfig(), EPISODES, config.fps, config.body())
     loop = EpisodeLoop(Simulation(config, EPISODES), task, FetchBrain())
-    specs = [EpisodeSpec(number, episode_seed(7, number, "held_out")) for number in range(EPISODES)]
-    episodes = list(loop.run(specs, lambda: False))
+    episodes = list(loop.run(SPECS, lambda: False))
     assert [episode.outcome.event for episode in episodes] == [Event.SUCCESS] * EPISODES
     for episode in episodes:
         assert [result.code for _, result in episode.results] == [ResultCode.SUCCEEDED] * len(episode.results)
@@ -45,6 +45,19 @@ def test_it_fetches_what_it_was_never_tuned_on() -> None:
         assert 0 < follows.sum() < episode.frames
         assert not applied[follows][:, 5:].any()
         np.testing.assert_allclose(applied[~follows][:, :4], np.tile(HOME[:4], ((~follows).sum(), 1)), atol=1e-5)
+
+
+def test_an_episode_is_the_same_alone_as_among_others() -> None:
+    config = TurtleBot3ManipulationConfig()
+    found = []
+    for n in (1, 3):
+        loop = EpisodeLoop(Simulation(config, n), FetchTask(FetchConfig(), n, config.fps, config.body()), FetchBrain())
+        found.append(list(loop.run(SPECS[:3], lambda: False)))
+    for alone, among in zip(*found, strict=True):
+        assert alone.frames == among.frames
+        assert alone.results == among.results
+        for key in ("control.applied_action", "simulation.state"):
+            np.testing.assert_array_equal(alone.columns[key], among.columns[key])
 
 
 class Desk:
