@@ -1,5 +1,6 @@
 """The last check before the wire: what is really written to the actuators, whatever computed it."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
@@ -99,12 +100,22 @@ class WireLimits:
 
 
 @kernel()
+def braking_way(change: float, bend: float) -> float:
+    """Return how far a command still goes whose changes, now `change` >= 0, fall by `bend` from tick to tick."""
+    if not change > bend:  # also if there is no limit
+        return 0.0
+    ticks = math.floor(change / bend)
+    return ticks * change - bend * ticks * (ticks + 1.0) * 0.5
+
+
+@kernel()
 def guard(state: Any, limits: Any) -> bool:
     """Let an actuator command through that is finite, in range, near enough to the last one, and bent gradually.
 
     It knows nothing of how it came about: it is for what nobody thought of, such as a trajectory in shared memory that
     another process overwrote. A safe command becomes what is `written`; another continues from there, at a falling
-    speed. A position servo's command may always come nearer to where the joint is: that takes torque away.
+    speed, for which a safe command leaves room before the end of the range. A position servo's command may always come
+    nearer to where the joint is: that takes torque away.
 
     Returns:
         Whether the command was safe.
@@ -115,7 +126,8 @@ def guard(state: Any, limits: Any) -> bool:
         change = value - state.written[k]
         # Not if it is no number.
         is_near = -limits.change[k] <= change <= limits.change[k] and limits.lower[k] <= value <= limits.upper[k]
-        is_bent = abs(change - state.written_rate[k]) > limits.bend[k]
+        room = limits.upper[k] - value if change > 0.0 else value - limits.lower[k]
+        is_bent = abs(change - state.written_rate[k]) > limits.bend[k] or braking_way(abs(change), limits.bend[k]) > room
         if is_bent and (value <= state.position[k] if change > 0.0 else change < 0.0 and value >= state.position[k]):
             is_bent = False
         is_safe = is_safe and is_near and not is_bent
