@@ -38,8 +38,8 @@ class LoopLimits:
 
 _BRAIN_ALIVE = int(Word.BRAIN_ALIVE)  # a plain number: an index of an enumeration costs a call
 
-Advance = Callable[[int], None]
-"""Lets the plant continue by a number of ticks."""
+Run = Callable[[int, int], None]
+"""Runs a tick of the cerebellum, at a time of its own [ns], and lets the plant continue by a number of ticks."""
 Serve = Callable[[int], None]
 """Answers requests of the bridge, at a time of the cerebellum [ns]."""
 Publish = Callable[[Slot, int, int, TickGrid], None]
@@ -52,11 +52,11 @@ class RealtimeLoop:
     """Runs ticks until a word says pause or end.
 
     Args:
-        cerebellum: what is run, of one robot.
+        cerebellum: what `run` runs, of one robot.
         words: the block's words.
         limits: when to stop the robot.
         serve: answers requests, before each tick.
-        advance: moves the plant on, after each tick.
+        run: runs a tick.
         publish: publishes the state, at the end of each tick.
         count: takes the timing of each tick.
         may_stand: asked after a pause or the end is wanted, before each tick, whether the robot may be left alone; it
@@ -72,7 +72,7 @@ class RealtimeLoop:
         limits: LoopLimits,
         *,
         serve: Serve,
-        advance: Advance,
+        run: Run,
         publish: Publish,
         count: Count,
         may_stand: Callable[[], bool] | None = None,
@@ -81,7 +81,7 @@ class RealtimeLoop:
     ) -> None:
         self.cerebellum, self.words, self.limits = cerebellum, words, limits
         self.period_ns = NANOSECONDS // cerebellum.control_hz
-        self._serve, self._advance, self._publish, self._count = serve, advance, publish, count
+        self._serve, self._run, self._publish, self._count = serve, run, publish, count
         self._may_stand = may_stand
         self._clock, self._sleep = clock, sleep
         self._brain_timeout_ns = round(limits.brain_timeout_s * NANOSECONDS)
@@ -127,8 +127,7 @@ class RealtimeLoop:
         if slot.skipped:
             ticks += min(slot.skipped, self.limits.most_catch_up)
             self.words[Word.CATCH_UP_LOST] += slot.skipped + 1 - ticks
-        self.cerebellum.tick(now)
-        self._advance(ticks)
+        self._run(now, ticks)
         self._publish(slot, started_ns, ended_ns, grid)
 
     def _watch(self, now_ns: int, grid: TickGrid) -> None:

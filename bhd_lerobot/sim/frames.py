@@ -6,9 +6,9 @@ The results are those of `Cerebellum.tick` and `World.step` in turns, bit for bi
 import ctypes
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
@@ -40,7 +40,6 @@ LAYOUT = record(
     "layout",
     [
         ("joints", np.int64),
-        ("ticks_hz", np.int64),
         ("substeps", np.int64),
         # Places of the joints in qpos and qvel, and of the actuators in ctrl.
         ("qpos", np.int64, (JOINTS,)),
@@ -144,20 +143,20 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
     touches: NDArray[np.bool_],
     efforts: Numbers,
     layouts: Any,
-    numbers: Counts,
-    first_tick: int,
-    ticks: int,
+    seen: Any,
+    done: Counts,
+    times: Counts,
     spec: int,
     arms: Any,
     springs: Any,
     brakes: Any,
     arm_limits: Any,
     geometries: Any,
-    trajectories: Any,
     ring: Any,
     latency: Any,
     waited: Any,
     written: int,
+    trajectories: Any,
 ) -> None:
     """Let some ticks of some simulations go by, one simulation after the other.
 
@@ -172,18 +171,19 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
         touches: becomes True where something was touched, shape (kinds, n): by an arm the table, objects with one of
             its links, itself; then by a base the scene.
         efforts: mean efforts of the last tick, shape (n, nv).
-        numbers: the tick that is next for each simulation, shape (n,).
-        first_tick: number of the first tick.
+        seen: becomes what is read of the joints after the last tick, as records of robots, shape (n,).
+        done: how many of these ticks each simulation has done, shape (n,).
+        times: what the ticks are for [ns], shape (ticks,).
         spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
         monitors: records of the collision monitors of bases; None of robots that do not drive.
         arms: records of arms with position servos; None of others, as is what follows of those without an arm.
         springs: records of the impedances of arms with torque motors; None of others, as is the following.
         brakes: for how many ticks the arms' brakes are closed, shape (n,).
-        trajectories: what arms play.
         ring: the last commands, of servos that get them late, shape (ticks, n, actuators); empty if none is late.
         latency: by how many ticks they are late, shape (n,).
         waited: ticks since that was set, shape (n,).
         written: commands that were written to the ring.
+        trajectories: what arms play.
     """
     layout = layouts[0]
     joints = layout.joints
@@ -191,9 +191,8 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
         state = states[sim]
         _set_state(models[sim], data, rows + sim * row_bytes, spec)
         warnings[:] = 0
-        for number in range(numbers[sim], first_tick + ticks):
-            numbers[sim] = number
-            now_ns = number * NANOSECONDS // layout.ticks_hz
+        for number in range(done[sim], len(times)):
+            now_ns = times[number]
             is_begun = False
             if arms is not None:
                 is_begun = arms[sim].stage != 0
@@ -227,15 +226,14 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
                 for k in range(joints):
                     ctrl[layout.ctrl[k]] = state.written[k]
             if ring is not None:
-                passed = number - first_tick
-                slot = written + passed
-                behind = slot - min(latency[sim], waited[sim] + passed)
+                slot = written + number
+                behind = slot - min(latency[sim], waited[sim] + number)
                 for k in range(joints):
                     ctrl[layout.ctrl[k]] = state.written[k]
                     if len(ring):
                         ring[slot % len(ring), sim, k] = state.written[k]
                         ctrl[layout.ctrl[k]] = ring[behind % len(ring), sim, k]
-            numbers[sim] = number + 1
+            done[sim] = number + 1
             for step in range(layout.substeps):
                 _step(models[sim], data)
                 if layout.touch_base >= 0 and sensordata[layout.touch_base] != 0.0:
@@ -261,7 +259,8 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
         _get_state(models[sim], data, rows + sim * row_bytes, spec)
         for k in range(len(warnings)):
             all_warnings[sim, k, 1] += warnings[k]
-        if numbers[sim] == first_tick + ticks:
+        if done[sim] == len(times):
+            read_joints(seen[sim], layout, qpos, qvel, efforts[sim], times[len(times) - 1])
             for k in range(layout.outputs):
                 _copy(layout.target[k] + sim * layout.nbytes[k], layout.source[k], layout.nbytes[k])
 
@@ -270,22 +269,17 @@ _WHERE = (
     "i8[::1], i8[::1], i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i4[:], i4[:,:,:], "
     "state[::1], queue[::1], i8[:,:]"
 )
-_WHAT = "limits[::1], f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], i8[:], i8, i8, i4"
+_WHAT = "limits[::1], f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], state[::1], i8[:], i8[::1], i4"
 _LATE = "f8[:,:,:], i8[:], i8[:], i8"
+_ARM = f"{_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], {_LATE}, f8[:,:,:]"
 run_base_frames = run_frames.of(
-    "run_base_frames", f"void({_WHERE}, monitor[::1], {_WHAT}, {', '.join(['none'] * 9)}, i8)"
+    "run_base_frames", f"void({_WHERE}, monitor[::1], {_WHAT}, {', '.join(['none'] * 8)}, i8, none)"
 )
-run_arm_frames = run_frames.of(
-    "run_arm_frames",
-    f"void({_WHERE}, none, {_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], f8[:,:,:], {_LATE})",
-)
-run_mobile_arm_frames = run_frames.of(
-    "run_mobile_arm_frames",
-    f"void({_WHERE}, monitor[::1], {_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], f8[:,:,:], {_LATE})",
-)
+run_arm_frames = run_frames.of("run_arm_frames", f"void({_WHERE}, none, {_ARM})")
+run_mobile_arm_frames = run_frames.of("run_mobile_arm_frames", f"void({_WHERE}, monitor[::1], {_ARM})")
 run_spring_frames = run_frames.of(
     "run_spring_frames",
-    f"void({_WHERE}, none, {_WHAT}, none, spring[::1], i8[:], arm_limits[::1], none, none, {_LATE})",
+    f"void({_WHERE}, none, {_WHAT}, none, spring[::1], i8[:], arm_limits[::1], none, {_LATE}, none)",
     work=tick_springs.work,
 )
 
@@ -345,6 +339,7 @@ class Frames:
         world: the simulations.
         cerebellum: what controls them; its controller is a part of the compiled tick.
         touches: becomes True where the scene was touched, see `run_frames`, shape (kinds, n).
+        seen: becomes what is read of the joints after the last tick, shape (n,).
         late: what its plant passes commands on through; None if it passes them on at once.
         brakes: those of arms with torque motors.
         gyro: name of the gyroscope; None if it is not read.
@@ -356,6 +351,7 @@ class Frames:
         world: World,
         cerebellum: Cerebellum,
         touches: NDArray[np.bool_],
+        seen: NDArray,
         *,
         late: Late | None = None,
         brakes: Brakes | None = None,
@@ -363,11 +359,12 @@ class Frames:
         beams: int = 0,
     ) -> None:
         self._world, self._cerebellum, self._touches, self._late = world, cerebellum, touches, late
+        self._seen_states = seen
         self._plant, self._pid = cerebellum.plant, os.getpid()
         self._handled = 0
         model, self._layout = world.model, np.zeros(1, LAYOUT)
         row, efforts = self._layout[0], world.servos
-        row["ticks_hz"], row["substeps"] = cerebellum.control_hz, world.physics_hz // cerebellum.control_hz
+        row["substeps"] = world.physics_hz // cerebellum.control_hz
         row["qpos_beside"], row["gripper"], row["joints"] = -1, -1, cerebellum.controller.joints
         row["touch"] = row["touch_base"] = -1
         servos = {} if world.body.arm is None else self._place_arm(row)
@@ -386,8 +383,10 @@ class Frames:
         self._threads: list[_Thread] = []
         self._free: SimpleQueue[_Thread] = SimpleQueue()
         self._pool: ThreadPoolExecutor | None = None
-        self._addresses, self._numbers, self._zeros = np.zeros((3, world.n), np.int64)
-        self._at_once = _NO_RING, self._zeros, self._zeros, 0
+        self._addresses, self._done, self._zeros = np.zeros((3, world.n), np.int64)
+        self._one_tick: Callable[[int, Any], None] | None = None
+        self._now = np.zeros(1, np.int64)
+        self._at_once = _NO_RING, self._zeros, self._zeros
         self._checked, self._copies = -1, False
         controller, self._brakes = cerebellum.controller, brakes
         self._kernel = run_base_frames
@@ -445,10 +444,52 @@ class Frames:
             world's.
         """
         own = self._cerebellum
-        if not self._is_possible or own.plant is not self._plant or not own.may_write or self._is_watched:
-            return False
         ids = np.arange(self._world.n) if ids is None else ids
         self._handled += len(ids) * self._kernel.work
+        if not self._is_ready():
+            return False
+        self._done[ids] = 0
+        if own.controller.arms is not None:
+            own.controller.arms["stage"] = 0  # whatever interrupted the last frame
+        times = np.arange(first_tick, first_tick + ticks) * NANOSECONDS // own.control_hz
+        self._run(ids, times)
+        own.now_ns = int(times[-1])
+        if self._late is not None and self._late.is_late:
+            self._late.pass_by(ticks)
+        return True
+
+    def tick(self, now_ns: int) -> bool:
+        """Let one tick of one robot go by, at any time [ns]; `run` has done it before in the same scene.
+
+        Returns:
+            False if nothing was done, as `run`.
+        """
+        own, late = self._cerebellum, self._late
+        if self._one_tick is None:
+            if not self._is_ready():
+                return False
+            rest = self._seen_states, self._done, self._now
+            arguments = self._threads[0].arguments(self._addresses, self._shared, *rest)
+            self._one_tick = partial(self._kernel.compiled, np.zeros(1, np.intp), *arguments)
+        own.now_ns = self._now[0] = now_ns
+        self._done[0] = 0
+        if own.controller.arms is not None:
+            own.controller.arms["stage"] = 0
+        is_late = late is not None and late.is_late
+        while True:
+            self._one_tick(*self._varying)
+            if self._done[0]:
+                break
+            own.serve()
+        if late is not None and is_late:
+            late.pass_by(1)
+        return True
+
+    def _is_ready(self) -> bool:
+        """Prepare for machine code; return whether it does what Python would."""
+        own = self._cerebellum
+        if not self._is_possible or own.plant is not self._plant or not own.may_write or self._is_watched:
+            return False
         if not is_worth_compiling(self._kernel, self._handled) or not _load():
             return False
         if not self._are_copied:
@@ -462,14 +503,11 @@ class Frames:
                 self._free.put(thread)
             if len(self._threads) > 1:
                 self._pool = ThreadPoolExecutor(len(self._threads), "frames")
-        self._numbers[ids] = first_tick
-        if own.controller.arms is not None:
-            own.controller.arms["stage"] = 0  # whatever interrupted the last frame
-        self._run(ids, first_tick, ticks)
-        own.now_ns = (first_tick + ticks - 1) * NANOSECONDS // own.control_hz
-        if self._late is not None and self._late.is_late:
-            self._late.pass_by(ticks)
         return True
+
+    def forget(self) -> None:
+        """Prepare anew before the next `tick`: another scene has begun."""
+        self._one_tick = None
 
     @property
     def _is_watched(self) -> bool:
@@ -477,16 +515,16 @@ class Frames:
         watched = self._plant, getattr(self._plant, "plant", self._plant), self._world, self._cerebellum
         return any(name in vars(one) for one in watched for name in _LEFT_OUT)
 
-    def _run(self, ids: NDArray[np.intp], first_tick: int, ticks: int) -> None:
+    def _run(self, ids: NDArray[np.intp], times: Counts) -> None:
         """Let ticks go by; what ticks of some simulations wait for is done while others go on."""
         if self._pool is None:
             while len(ids):
-                ids = self._run_share(ids, first_tick, ticks, self._shared)
+                ids = self._run_share(ids, times, self._shared)
                 if len(ids):
                     self._cerebellum.serve(ids)
             return
         shares = np.array_split(ids, min(len(ids), _SHARES * len(self._threads)))
-        jobs = {self._pool.submit(self._run_share, share, first_tick, ticks, self._shared) for share in shares}
+        jobs = {self._pool.submit(self._run_share, share, times, self._shared) for share in shares}
         try:
             while jobs:
                 done, jobs = wait(jobs, return_when=FIRST_COMPLETED)
@@ -494,18 +532,18 @@ class Frames:
                     left = job.result()
                     if len(left):
                         self._cerebellum.serve(left)
-                        jobs.add(self._pool.submit(self._run_share, left, first_tick, ticks, self._shared))
+                        jobs.add(self._pool.submit(self._run_share, left, times, self._shared))
         finally:
             wait(jobs)  # whatever interrupts this: no other frame begins meanwhile
 
-    def _run_share(self, ids: NDArray[np.intp], first_tick: int, ticks: int, shared: Any) -> NDArray[np.intp]:
+    def _run_share(self, ids: NDArray[np.intp], times: Counts, shared: Any) -> NDArray[np.intp]:
         """Let ticks of some simulations go by; return those that wait for their controller."""
         thread = self._free.get()
         try:
-            thread.run(self._kernel, ids, self._addresses, shared, self._numbers, first_tick, ticks)
+            thread.run(self._kernel, ids, self._addresses, shared, self._seen_states, self._done, times, *self._varying)
         finally:
             self._free.put(thread)
-        return ids[self._numbers[ids] < first_tick + ticks]
+        return ids[self._done[ids] < len(times)]
 
     @property
     def _are_copied(self) -> bool:
@@ -524,20 +562,25 @@ class Frames:
 
     @property
     def _shared(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """What all threads run with, before and after the layout."""
+        """What all threads run with, before and after the layout; behind it comes what `_varying` is."""
         own, late = self._cerebellum, self._late
         controller, reading = own.controller, own.reading
         records = own.states, own.fifo.queues, own.estop.words, controller.monitors
         sensors = reading.sensors, reading.sensors_ns, self._touches, self._world.efforts
-        arms: tuple[Any, ...] = (*[None] * 9, 0)
+        arms: tuple[Any, ...] = (None,) * 8
         if controller.arm_limits is not None:
             if controller.arms is not None:
-                arms = controller.arms, None, None, controller.arm_limits, controller.geometries, controller.rows
+                arms = controller.arms, None, None, controller.arm_limits, controller.geometries
             elif self._brakes is not None:
-                arms = None, controller.springs, self._brakes.ticks, controller.arm_limits, None, None
-            is_late = late is not None and late.is_late
-            arms += (late.ring, late.latency, late.waited, late.written) if late and is_late else self._at_once
+                arms = None, controller.springs, self._brakes.ticks, controller.arm_limits, None
+            arms += (late.ring, late.latency, late.waited) if late and late.is_late else self._at_once
         return (self._world.warnings, *records, own.numbers, *sensors), arms
+
+    @property
+    def _varying(self) -> tuple[int, Any]:
+        """What changes from frame to frame: commands that were written to the ring, and trajectories."""
+        late = self._late
+        return late.written if late and late.is_late else 0, self._cerebellum.controller.rows
 
     def _take_models(self) -> None:
         """Make the simulations' models again if their fields have changed."""
@@ -575,16 +618,12 @@ class _Thread:
         with self._lock:
             self._run(*arguments)
 
-    def _run(  # noqa: PLR0917
-        self,
-        kernel: Any,
-        ids: NDArray,
-        models: Counts,
-        shared: tuple[Any, Any],
-        numbers: Counts,
-        first_tick: int,
-        ticks: int,
-    ) -> None:
+    def _run(self, kernel: Any, ids: NDArray, models: Counts, shared: tuple[Any, Any], *rest: Any) -> None:
+        *rest, written, rows = rest
+        kernel.compiled(ids, *self.arguments(models, shared, *rest), written, rows)
+
+    def arguments(self, models: Counts, shared: tuple[Any, Any], *rest: Any) -> tuple[Any, ...]:
+        """Return the arguments of `run_frames` but the first and the last two."""
         state, row = self._world.state, self._layout[0]
         if len(self._world.outputs) != self._outputs:
             for k, (name, target) in enumerate(self._world.outputs.items()):
@@ -593,5 +632,4 @@ class _Thread:
             self._outputs = row["outputs"] = len(self._world.outputs)
         where = self._data._address, state.ctypes.data, state.strides[0]
         before, arms = shared
-        arguments = *where, *self._fields, *before, self._layout, numbers
-        kernel.compiled(ids, models, *arguments, first_tick, ticks, _STATE, *arms)
+        return (models, *where, *self._fields, *before, self._layout, *rest, _STATE, *arms)

@@ -49,19 +49,12 @@ class VirtualLoop:
         self.modes: list[int] = []
         self.speeds: list[float] = []
         self.watchdogs: list[int] = []
-        tick = self.rig.cerebellum.tick
-
-        def spy(now_ns: int) -> None:
-            self.given.append(now_ns)
-            tick(now_ns)
-
-        self.rig.cerebellum.tick = spy  # type: ignore[method-assign]
         self.loop = RealtimeLoop(
             self.rig.cerebellum,
             self.words,
             limits or LoopLimits(most_misses=10**6),
             serve=self._serve,
-            advance=self._advance,
+            run=self._run,
             publish=self._publish,
             count=lambda *timing: self.counted.append(timing),
             clock=lambda: self.now,
@@ -81,7 +74,9 @@ class VirtualLoop:
     def _serve(self, now_ns: int) -> None:
         self.served.append(now_ns)
 
-    def _advance(self, ticks: int) -> None:
+    def _run(self, now_ns: int, ticks: int) -> None:
+        self.given.append(now_ns)
+        self.rig.cerebellum.tick(now_ns)
         self.passed.append(ticks)
 
     def _publish(self, slot: Slot, started_ns: int, ended_ns: int, grid: TickGrid) -> None:

@@ -49,9 +49,25 @@ def make(n: int, threads: int | None = None, **options: Any) -> Simulation:
     return simulation
 
 
-def run(n: int, threads: int | None = None, **options: Any) -> NDArray[np.float64]:
+def tick_alone(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the ticks of a simulation go by one by one, as on the wall clock."""
+    bridge = simulation.bridge
+
+    def advance_ticks(ticks: int) -> None:
+        for _ in range(ticks):
+            simulation.run_tick(bridge.now_ns, 1)
+            bridge._tick += 1
+
+    monkeypatch.setattr(bridge, "advance_ticks", advance_ticks)
+
+
+def run(
+    n: int, threads: int | None = None, alone: pytest.MonkeyPatch | None = None, **options: Any
+) -> NDArray[np.float64]:
     """Return everything that is observed, reported and true of bases that run into things, stop, and go on."""
     simulation, rng, rows = make(n, threads, **options), np.random.default_rng(0), []
+    if alone is not None:
+        tick_alone(simulation, alone)
     friction = simulation.world.model_field("geom_friction")
     for frame in range(FRAMES):
         if frame == 8:
@@ -61,6 +77,7 @@ def run(n: int, threads: int | None = None, **options: Any) -> NDArray[np.float6
             simulation.bridge.activate()
         if frame == 16:
             friction[:, :, 0] *= 0.3  # written to between two frames: it counts from the next step on
+            simulation._frames.forget()
         if frame == 20 and n > 1:
             simulation.stop(np.array([1]))
         if frame == 24 and n > 1:
@@ -71,6 +88,7 @@ def run(n: int, threads: int | None = None, **options: Any) -> NDArray[np.float6
         efforts = report.columns["control.effort"]
         every = np.concatenate([seen.state, report.applied, flags, efforts, simulation.physics_state], axis=1)
         rows.append(np.where(simulation.running[:, None], every, 0.0))  # of robots that were left alone nothing is said
+    assert alone is None or simulation._frames._one_tick is not None
     simulation.close()
     return np.array(rows)
 
@@ -89,6 +107,8 @@ def test_frames_are_the_bits_of_ticks_and_steps_in_turns(
     calls = count_calls(monkeypatch)
     fast = run(n, threads, **options)
     assert calls
+    if n == 1:
+        np.testing.assert_array_equal(run(1, alone=monkeypatch, **options), fast)
     with kernels.never_compiled():
         calls.clear()
         plain = run(n, threads, **options)
@@ -99,9 +119,14 @@ def test_frames_are_the_bits_of_ticks_and_steps_in_turns(
 class Reacher:
     """What arms are told to do: by setpoints, by goals, and something else in between."""
 
-    def __init__(self, n: int, threads: int | None, options: dict[str, Any]) -> None:
+    def __init__(
+        self, n: int, threads: int | None, options: dict[str, Any], alone: pytest.MonkeyPatch | None = None
+    ) -> None:
         config = UR5Config(**options)
         self.arm = Simulation(config, n, threads)
+        self.alone = alone is not None
+        if alone is not None:
+            tick_alone(self.arm, alone)
         self.task = PickTask(
             PickConfig(randomisation=RandomisationConfig(enabled=True, latency_s=0.01)), n, config.fps, config.body()
         )
@@ -150,6 +175,7 @@ class Reacher:
             every += [true.tool_pose, self.arm.physics_state]
             row = np.concatenate(every, axis=1)
             rows.append(np.where(self.arm.running[:, None], row, 0.0))
+        assert not self.alone or self.arm._frames._one_tick is not None
         self.arm.close()
         return np.array(rows)
 
@@ -172,6 +198,8 @@ def test_frames_of_arms_are_the_bits_of_ticks_and_steps_in_turns(
     calls = count_calls(monkeypatch)
     fast = Reacher(n, threads, options).run()
     assert len(calls) >= 44
+    if n == 1:
+        np.testing.assert_array_equal(Reacher(1, threads, options, monkeypatch).run(), fast)
     with kernels.never_compiled():
         calls.clear()
         plain = Reacher(n, threads, options).run()

@@ -418,6 +418,17 @@ class Host:
         """Let one control tick go by."""
         self.tick += 1
 
+    def run_tick(self, now_ns: int, ticks: int) -> None:
+        """Run one tick of control on the wall clock, and let the robot go on by some ticks.
+
+        Args:
+            now_ns: the time that the tick is for [ns].
+            ticks: how many; more than one after ticks that were skipped.
+        """
+        self.cerebellum.tick(now_ns)
+        for _ in range(ticks):
+            self.advance()
+
     def run_ticks(self, number: int, most: int) -> int:
         """Run ticks of control and world at once, see `LockstepBridge`; none here."""
         return 0

@@ -142,7 +142,7 @@ class LiveProcess:
             self._words,
             spec.limits,
             serve=self._serve,
-            advance=self._advance,
+            run=self._host.run_tick,
             publish=self._publisher.publish,
             count=self._statistics.add,
             may_stand=None if self._plant is None else self._may_stand,
@@ -188,9 +188,8 @@ class LiveProcess:
         grid = TickGrid(0, self._loop.period_ns)
         for tick in range(self._warm_up_ticks):
             self._host.cerebellum.stamp_origin_ns = time.monotonic_ns() - tick * self._loop.period_ns
-            self._host.cerebellum.tick(tick * self._loop.period_ns)
+            self._host.run_tick(tick * self._loop.period_ns, 1)
             self._requests.serve(0)
-            self._advance(1)
             self._publisher.publish(Slot(tick, 0, 0, 0), 0, 0, grid)
             self._statistics.add(0, 0, 0, 0)
         if self._plant is not None:
@@ -246,10 +245,6 @@ class LiveProcess:
         newest = int(reading.stamp_ns[0])
         newest = max(newest, int(reading.sensors_ns[0])) if reading.sensors.shape[1] else newest
         return max(0, time.monotonic_ns() - newest)
-
-    def _advance(self, ticks: int) -> None:
-        for _ in range(ticks):
-            self._host.advance()
 
     def close(self) -> None:
         """Free everything."""

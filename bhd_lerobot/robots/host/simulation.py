@@ -13,6 +13,7 @@ from bhd_lerobot.bodies.tabletop import MAX_LATENCY_S
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.record import new_states
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.robots import Acceptance, Deliver, FrameReport
 from bhd_lerobot.robots.parts.latency import LatePlant
@@ -76,9 +77,10 @@ class Simulation(Host):
         for part in self.parts:
             part.touches = self._touches[first : (first := first + part.touch_kinds)]
         self._touched = tuple(self._touches)
-        self._reading = PlantReading(n, self.controller.joints)
+        states = new_states(n)
+        self._reading, self._is_read = PlantReading(n, self.controller.joints, states=states), False
         gyro = {"gyro": GYROSCOPE, "beams": config.beams} if body.drive is not None and config.imu else {}
-        self._frames = Frames(world, self.cerebellum, self._touches, late=plant, brakes=joints.brakes, **gyro)
+        self._frames = Frames(world, self.cerebellum, self._touches, states, late=plant, brakes=joints.brakes, **gyro)
         self._active: NDArray[np.intp] | None = None
         self._camera: Camera | None = None
         self._render_thread: RenderThread | None = None
@@ -108,7 +110,9 @@ class Simulation(Host):
 
     def read(self) -> PlantReading:
         """Return the joints as they are now."""
-        self.plant.read(self._reading)
+        if not self._is_read:
+            self.plant.read(self._reading)
+        self._is_read = False  # whatever comes next may move them
         return self._reading
 
     @property
@@ -124,6 +128,7 @@ class Simulation(Host):
         for part in reversed(self.parts):  # an arm's objects stand on what is in the arena
             part.place(ids, scenes)
         self._touches[:, ids] = False
+        self._frames.forget()
 
     def privileged_state(self) -> NDArray[np.float64]:
         """Return what is true and no sensor measures, numbers around 1, shape (n, any); for a critic."""
@@ -235,6 +240,17 @@ class Simulation(Host):
         self.world.step(self.rates.steps_per_tick, self._active, each=self._after_step)
         self.tick += 1
         self._after_tick()
+
+    def run_tick(self, now_ns: int, ticks: int) -> None:
+        """Run one tick of control, and let the world go on by some, see `Host.run_tick`."""
+        if not (self._is_plain and self._frames.tick(now_ns)):
+            super().run_tick(now_ns, ticks)
+            return
+        self.tick += 1
+        self._after_tick()
+        self._is_read = ticks == 1
+        for _ in range(ticks - 1):
+            self.advance()
 
     def run_ticks(self, number: int, most: int) -> int:
         """Run ticks in machine code, see `LockstepBridge`; none where somebody does something in between."""

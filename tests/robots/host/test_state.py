@@ -38,10 +38,7 @@ class Rig:
     def tick(self, late_ns: int = 0) -> None:
         self.now = max(self.now, self.grid.next_due_ns) + late_ns
         slot = self.grid.begin(self.now)
-        ticks = 1 + slot.skipped
-        self.simulation.cerebellum.tick(slot.due_ns - self.grid.start_ns)
-        for _ in range(ticks):
-            self.simulation.advance()
+        self.simulation.run_tick(slot.due_ns - self.grid.start_ns, 1 + slot.skipped)
         self.now += 100_000
         self.publisher.publish(slot, self.now - 100_000, self.now, self.grid)
         self.grid.end(self.now)
