@@ -127,7 +127,9 @@ def guard(state: Any, limits: Any) -> bool:
         # Not if it is no number.
         is_near = -limits.change[k] <= change <= limits.change[k] and limits.lower[k] <= value <= limits.upper[k]
         room = limits.upper[k] - value if change > 0.0 else value - limits.lower[k]
-        is_bent = abs(change - state.written_rate[k]) > limits.bend[k] or braking_way(abs(change), limits.bend[k]) > room
+        is_bent = (
+            abs(change - state.written_rate[k]) > limits.bend[k] or braking_way(abs(change), limits.bend[k]) > room
+        )
         if is_bent and (value <= state.position[k] if change > 0.0 else change < 0.0 and value >= state.position[k]):
             is_bent = False
         is_safe = is_safe and is_near and not is_bent

@@ -619,8 +619,8 @@ class _Thread:
             self._run(*arguments)
 
     def _run(self, kernel: Any, ids: NDArray, models: Counts, shared: tuple[Any, Any], *rest: Any) -> None:
-        *rest, written, rows = rest
-        kernel.compiled(ids, *self.arguments(models, shared, *rest), written, rows)
+        *before, written, rows = rest
+        kernel.compiled(ids, *self.arguments(models, shared, *before), written, rows)
 
     def arguments(self, models: Counts, shared: tuple[Any, Any], *rest: Any) -> tuple[Any, ...]:
         """Return the arguments of `run_frames` but the first and the last two."""
