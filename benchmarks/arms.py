@@ -14,7 +14,7 @@ from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.manipulation.pick import PickBrain
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask

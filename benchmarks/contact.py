@@ -21,7 +21,7 @@ from benchmarks._turns import status
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 
 LIGHT_N, WITHIN_S = 20.0, 0.5

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks._report import Report, parse_options
 from benchmarks._turns import seconds
 from bhd_lerobot.bodies.body import Rates, Shape
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum

@@ -21,7 +21,7 @@ from eaik.IK_DH import DhRobot
 from benchmarks._report import Report, parse_options
 from benchmarks._turns import seconds
 from bhd_lerobot.bodies.body import ArmChain, Placement
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.numeric_inverse import NumericInverse

@@ -19,7 +19,7 @@ from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_
 from bhd_lerobot.control.motion.line import ToolLimits, along_line
 from bhd_lerobot.control.motion.planner import GoalPlanner
 from bhd_lerobot.control.motion.trajectory import MotionLimits, PlanFailure, Trajectory
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 
 GOAL = 1.15
 _BOX = np.array([[0.30, -0.35, 0.10], [0.65, 0.35, 0.50]])  # where lines begin and end [m]

@@ -14,7 +14,7 @@ from benchmarks._report import Report, parse_options
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.poses import pose_vectors
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 
 PATH_GOAL_M, SETTLE_GOAL_S = 0.001, 0.2

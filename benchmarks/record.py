@@ -31,7 +31,7 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask

@@ -25,7 +25,7 @@ import numpy as np
 
 from benchmarks._report import Report, parse_options
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.robots.arm_plant import ArmPlant
 from bhd_lerobot.ros2.robots.base_plant import BasePlant

@@ -61,7 +61,7 @@ from bhd_lerobot.policies.perception.perceiver import Perceiver, PerceptionOptio
 from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.policies.pixels.modeling_pixels import PixelsPolicy
 from bhd_lerobot.registry import make_robot, make_simulation
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.sim.camera import Camera
 

@@ -34,7 +34,7 @@ from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 

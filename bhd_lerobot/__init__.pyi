@@ -20,7 +20,7 @@ from bhd_lerobot.bodies.tabletop import TableScene as TableScene
 from bhd_lerobot.bodies.truth import ArmTruth as ArmTruth
 from bhd_lerobot.bodies.truth import BaseTruth as BaseTruth
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger as turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5 as ur5
+from bhd_lerobot.bodies.ur import ur5 as ur5
 from bhd_lerobot.control.commands import BrainCommand as BrainCommand
 from bhd_lerobot.control.commands import Chunk as Chunk
 from bhd_lerobot.control.commands import CommandResult as CommandResult
@@ -57,10 +57,10 @@ from bhd_lerobot.robots.base import SimulatedBase as SimulatedBase
 from bhd_lerobot.robots.config import MobileBaseConfig as MobileBaseConfig
 from bhd_lerobot.robots.config_arm import FileArmConfig as FileArmConfig
 from bhd_lerobot.robots.config_arm import GripperOptions as GripperOptions
-from bhd_lerobot.robots.config_ur5 import UR5Config as UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config as UR5Config
 from bhd_lerobot.robots.conformance import check_robot as check_robot
 from bhd_lerobot.robots.host.config import RealtimeConfig as RealtimeConfig
-from bhd_lerobot.robots.ur5 import UR5 as UR5
+from bhd_lerobot.robots.ur import UR5 as UR5
 from bhd_lerobot.rollout.replay import ReplayConfig as ReplayConfig
 from bhd_lerobot.tasks.task import ArmTask as ArmTask
 from bhd_lerobot.tasks.task import BaseTask as BaseTask

@@ -13,7 +13,7 @@ from lerobot.robots.config import RobotConfig
 import bhd_lerobot.robots.config_arm
 import bhd_lerobot.robots.config_mobile_arm
 import bhd_lerobot.robots.config_turtlebot3
-import bhd_lerobot.robots.config_ur5
+import bhd_lerobot.robots.config_ur
 import bhd_lerobot.ros2.robots.config_robot
 import bhd_lerobot.tasks.avoid
 import bhd_lerobot.tasks.fetch
@@ -39,6 +39,7 @@ from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.topic.brain import TopicBrain
+from bhd_lerobot.robots.config import BhdRobotConfig
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.names import names_of_robot
 from bhd_lerobot.tasks.free import FreeConfig
@@ -79,10 +80,17 @@ class _Blanked(BlankedBrain):
         return robot_of_brain(config.brain)
 
 
+def _own_robots() -> list[str]:
+    """Return the types of the simulated robots of this package: others may be known to LeRobot already."""
+    return sorted(
+        name
+        for name, config in RobotConfig.get_known_choices().items()
+        if issubclass(config, BhdRobotConfig) and config.__module__.startswith(f"{__package__}.")
+    )
+
+
 _SIMULATION = "bhd_lerobot.robots.host.simulation:Simulation"
-ROBOTS: Registry[Any] = Registry(
-    "robot", dict.fromkeys(("arm", "so101", "turtlebot3", "turtlebot3_manipulation", "ur5"), _SIMULATION), RobotConfig
-)
+ROBOTS: Registry[Any] = Registry("robot", dict.fromkeys(_own_robots(), _SIMULATION), RobotConfig)
 """The classes of the robots' simulations, by type; those of this package import MuJoCo."""
 
 

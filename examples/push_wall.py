@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 from bhd_lerobot.bodies.body import Rates, Shape
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.bridge import LockstepBridge
 from bhd_lerobot.control.cerebellum import Cerebellum

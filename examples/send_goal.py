@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 from bhd_lerobot.control.commands import BrainCommand, Pose
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.config_ur import UR5Config
+from bhd_lerobot.robots.ur import UR5
 
 FEEDBACK_S = 0.2  # simulated time between two lines of feedback [s]
 

@@ -31,9 +31,9 @@ from bhd_lerobot.options.help import meanings_of, summary_of
 from bhd_lerobot.options.parse import choices_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.parts.names import drive_observation_names
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5
 from bhd_lerobot.rollout.replay import ReplayConfig
 from bhd_lerobot.ros2.serve.bridge import BridgeConfig
 from bhd_lerobot.ros2.serve.serve import ServeConfig
@@ -136,14 +136,18 @@ def _defaults(one: Any) -> list[tuple[str, str]]:
 
 
 def _with_some_of(one: Any, others: Mapping[str, type], chosen: str) -> str | None:
-    """Return the type that has many of a class's options and no others, the last of those that are alike."""
-    found, own = None, _defaults(one)
+    """Return the type that has many of a class's options and no others; of those that are alike one of a short name."""
+    found, own = [], _defaults(one)
     for name, other in others.items():
         theirs = _defaults(other)
         alike = len(theirs) == len(own)
-        if name != chosen and len(theirs) > _MANY and set(theirs) <= set(own) and not (alike and name < chosen):
-            found = name
-    return found
+        if name != chosen and len(theirs) > _MANY and set(theirs) <= set(own):
+            found += [name] if not alike or _rank(name) > _rank(chosen) else []
+    return max(found, key=_rank, default=None)
+
+
+def _rank(name: str) -> tuple[int, str]:
+    return -len(name), name
 
 
 def _index() -> str:

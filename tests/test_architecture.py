@@ -28,15 +28,15 @@ NEVER_IN = {
     "mujoco": ("options", "bodies", "control", "realtime"),
 }
 # The bodies of our two robots, and what may know them: their configurations, presets and defaults. Others ask a `Body`.
-OWN_BODIES = ("bodies.so101", "bodies.turtlebot3", "bodies.turtlebot3_manipulation", "bodies.ur5")
+OWN_BODIES = ("bodies.so101", "bodies.turtlebot3", "bodies.turtlebot3_manipulation", "bodies.ur")
 OF_OWN_BODIES = {
     *(
         "robots.config_arm",
         "robots.config_mobile_arm",
         "robots.config_turtlebot3",
-        "robots.config_ur5",
+        "robots.config_ur",
     ),
-    *("ros2.messages.presets", "cli.data.import_bag"),
+    *("ros2.messages.presets", "ros2.messages.robot_views", "cli.data.import_bag"),
     *("teleoperators.config_bhd_keyboard_base", "policies.cnn.configuration_cnn"),
 }
 # What of LeRobot is made for plug-ins; everything else moves from version to version, and only `stock` imports it.

@@ -151,7 +151,7 @@ trajectory.check_version = lambda name: versions.check_version(name, absent)
 from bhd_lerobot.errors import VersionError
 from bhd_lerobot.registry import make_simulation
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 
 with TurtleBot3(TurtleBot3Config(arena="empty")) as robot:

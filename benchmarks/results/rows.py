@@ -45,9 +45,11 @@ class Rows:
         kind, (ref, spec) = next(iter(spec)), (next(iter(spec.values())), dict(spec))
         refs = ref if isinstance(ref, list) else [ref]
         names = {one.partition(":")[0] if ":" in one else self.section for one in refs}
-        seeds = [seed for seed in self.seeds if all((name, seed) in self.parts for name in names)]
+        seeds: list[Any] = [seed for seed in self.seeds if all((name, seed) in self.parts for name in names)]
         if "seed" in words:
             seeds = [seed for seed in seeds if seed == words["seed"]]
+        elif not seeds and all((name, None) in self.parts and self.parts[name, None].measured for name in names):
+            seeds = [None]  # of what is run once
         if seeds:
             yield from getattr(self, f"_{kind}")(spec, refs, seeds)
 

@@ -13,5 +13,5 @@ __all__ = [
     "truth",
     "turtlebot3",
     "turtlebot3_manipulation",
-    "ur5",
+    "ur",
 ]

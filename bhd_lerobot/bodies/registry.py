@@ -1,17 +1,18 @@
 """The body of every robot, for whoever reads its data and makes no robot."""
 
 from collections.abc import Callable, Set
+from functools import partial
 
 from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import MODELS, ur, ur5
 from bhd_lerobot.options.plugins import load_plugins
 from bhd_lerobot.options.registry import Registry
 
 _OWN: dict[str, Callable[[], Body] | str] = {  # those of files are added by `bhd_lerobot.registry`
     "turtlebot3": turtlebot3_burger,
-    "ur5": ur5,
+    **{name: partial(ur, name) for name in MODELS},
     "arm": ur5,  # stands for the arms that are files
     "turtlebot3_manipulation": turtlebot3_manipulation,
 }

@@ -7,7 +7,7 @@ __all__ = [
     "config_arm",
     "config_mobile_arm",
     "config_turtlebot3",
-    "config_ur5",
+    "config_ur",
     "conformance",
     "device",
     "external",
@@ -16,6 +16,6 @@ __all__ = [
     "parts",
     "robot",
     "turtlebot3",
-    "ur5",
+    "ur",
     "viewer",
 ]

@@ -6,6 +6,7 @@ same objects, servos and sensors of touches: see scene.py.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ HANDLE_PARTS = 3
 PARKED = tuple((3.0 * number, 0.0, 100.0) for number in range(MAX_OBJECTS))
 FLOOR = -0.75  # [m]
 _OVERVIEW = CameraView((1.75, -1.30, 0.95), (0.30, 0.0, 0.20), 29.0)
+_OVERSEEN = 1.4  # [m] reach of the arms that it is made for; it sees as much more as others reach farther
 TABLE_TOP = "table_top"  # what is seen of it
 _TABLE = (-0.35, 1.05, 0.70)  # edges behind and before the base, half the width [m]
 
@@ -37,7 +39,8 @@ def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence
     _add_room(spec)
     _add_table(spec)
     _add_lights(spec)
-    for name, view in (("scene", SCENE_CAMERA), ("overview", _OVERVIEW)):
+    overview = replace(_OVERVIEW, fovy=_OVERVIEW.fovy * max(1.0, arm.chain.reach / _OVERSEEN))
+    for name, view in (("scene", SCENE_CAMERA), ("overview", overview)):
         axes = _towards(view.position, view.target)
         spec.worldbody.add_camera(name=name, pos=view.position, xyaxes=axes, fovy=view.fovy)
     _add_handled(spec, arm.gripper)

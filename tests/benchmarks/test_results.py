@@ -52,7 +52,7 @@ def test_the_commands_of_a_section_are_those_of_the_page_and_their_options_are_v
             parse(RecordConfig, options)
         elif kind == "bhd-eval":
             config = parse(EvalConfig, options)
-            assert set(config.only) <= set(config.brains)
+            assert set(config.only or ()) <= set(config.brains)
         elif kind == "bhd-train":
             assert Path(options[0].partition("=")[2]).is_file()
             if "/dagger_" in options[0]:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.body import Arm, CameraSpec, Drive, LidarSpec, Limits, Rates, Shape
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.errors import BhdError, ConfigError
 from tests.cases import each_case
 

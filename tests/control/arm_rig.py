@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.bodies.body import Body
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, ResultCode

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, GoalPhase, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.messages import NANOSECONDS, Mode
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus

@@ -50,7 +50,7 @@ def test_the_reference_is_up_to_date() -> None:
     options = ROOT / "docs" / "reference" / "options"
     written = {path: path.read_text(encoding="utf-8") for path in [options.with_suffix(".md"), *options.iterdir()]}
     assert written == pages, "run: python scripts/make_reference.py"
-    assert sum(len(text.splitlines()) for text in pages.values()) <= 1180
+    assert sum(len(text.splitlines()) for text in pages.values()) <= 1190
 
 
 def test_an_option_without_a_description_is_found() -> None:

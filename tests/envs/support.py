@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.envs.register import ENVIRONMENTS
 
 NAMES = tuple(ENVIRONMENTS)

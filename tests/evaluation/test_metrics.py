@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.evaluation.metrics import JerkMeasure, measure

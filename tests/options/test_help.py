@@ -43,7 +43,9 @@ def test_a_chosen_type_lists_its_options_with_units_and_defaults() -> None:
 
 @pytest.mark.parametrize("program", [ServeConfig, BridgeConfig])
 def test_types_that_a_program_refuses_are_not_listed(program: type) -> None:
-    assert "Valid: arm, so101, turtlebot3, ur5. Its options" in " ".join(help_of(program, {}).split())
+    assert "Valid: arm, so101, turtlebot3, ur10e, ur3e, ur5, ur5e. Its options" in " ".join(
+        help_of(program, {}).split()
+    )
 
 
 def test_brains_by_name() -> None:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation, RobotFeatures

@@ -18,7 +18,7 @@ from bhd_lerobot.policies.manipulation.servo import PickServoConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.registry import make_brain, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.rollout.drivers import DriverLog, Intervention, flagged
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.replay import Replay

@@ -270,7 +270,7 @@ def test_a_camera_is_recorded_frame_by_frame(tmp_path):
         ({**ARM, "brain__type": "reach"}, "target_x"),
         (
             {**ARM, "robot__type": "turtlebot3_manipulation", "task__type": "reach", "brain__type": "reach"},
-            "without a drive; .* Valid: arm, so101, ur5. Tasks of turtlebot3_manipulation: avoid, fetch",
+            "without a drive; .* Valid: arm, so101, ur10e, .* Tasks of turtlebot3_manipulation: avoid, fetch",
         ),
         ({**ARM, "task__max_objects": 6}, "max_objects is 6"),
         ({**ARM, "task__randomisation__size": 1.5}, "randomisation.size is 1.5"),

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Rates, Shape
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.bridge import LockstepBridge

@@ -1,7 +1,8 @@
-"""Arms that are files as robots: features, the contract, and tasks by rule, with a jaw and without a gripper."""
+"""Arms that are files as robots: features, the contract, and tasks by rule, as of other arms."""
 
 import re
 from importlib import resources
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,10 @@ def test_it_keeps_the_contract_of_a_robot(kind: str, bare: Path) -> None:
     check_robot(lambda: SO101(SO101Config()) if kind == "jaw" else FileArm(FileArmConfig(mjcf=bare)))
 
 
-@each_case(("task", "robot"), [("reach", "so101"), ("reach", "arm"), ("pick", "so101")])
+@each_case(
+    ("task", "robot"),
+    [*product(("reach", "pick"), ("so101", "ur3e")), ("pick", "ur5e"), ("pick", "ur10e"), ("reach", "arm")],
+)
 def test_tasks_are_solved_by_rule(task: str, robot: str, bare: Path, tmp_path: Path) -> None:
     names = {"robot__type": robot, "task__type": task, "brain__type": task}
     file = str(bare) if robot == "arm" else None

@@ -13,9 +13,9 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.messages import Limit, Mode, Request, Watchdog
 from bhd_lerobot.errors import CommandRefusedError, ConfigError
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5
 from tests.robots.forces import Contacts, Wall
 
 FIRST = np.zeros(1, np.intp)

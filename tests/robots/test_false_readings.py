@@ -11,7 +11,7 @@ from benchmarks import wire
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.messages import Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from tests.robots.forces import Wall
 

@@ -11,7 +11,7 @@ from bhd_lerobot.bodies.tabletop import TableObject, TableScene
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Pose, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.policies.manipulation.grasp import pointing_down
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from tests.robots.forces import Contacts
 

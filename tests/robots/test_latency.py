@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.body import Body, Shape
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.commands import BrainCommand, Goals, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.parts.latency import MAX_LATENCY, LatePlant
 from tests.cases import each_case

@@ -9,7 +9,7 @@ from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from tests.cases import each_case
 

@@ -8,15 +8,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
-from bhd_lerobot.bodies.ur5 import JOINTS
+from bhd_lerobot.bodies.ur import JOINTS
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Reason
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.parts.arm import pose_matrices
 from bhd_lerobot.robots.parts.names import TOOL_NAMES
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5
 
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
 

@@ -13,7 +13,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.brain import ConfiguredBrain, is_privileged
 from bhd_lerobot.registry import make_robot, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig

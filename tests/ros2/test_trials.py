@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binomtest
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.cli import record, train
 from bhd_lerobot.cli.data.main import main as data
 from tests.ros2.peer_env import Peer, environment

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Placement
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import MODELS, ur
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.record import SHAPES
@@ -72,8 +72,9 @@ def test_frames_and_jacobian_are_those_of_the_engine(joints: int, degree: bool, 
         assert np.linalg.norm(forward.tool(q)[:3, 3]) < chain.reach
 
 
-def test_the_frames_of_the_ur5_are_its_own() -> None:
-    body = ur5()
+@pytest.mark.parametrize("name", MODELS)
+def test_the_frames_of_a_ur_are_its_own(name: str) -> None:
+    body = ur(name)
     own, read = ForwardKinematics(body.need(Arm).chain), ForwardKinematics(chain_from_mjcf(body.mjcf, "tool"))
     postures = RNG.uniform(-np.pi, np.pi, (50, 6))
     np.testing.assert_allclose(read.tool(postures), own.tool(postures), atol=1e-12)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.sim.world import World
 
 RATES = ((500, 5), (500, 20), (1000, 2), (100, 1), (200, 2))  # physics steps a second, and in a tick

@@ -14,7 +14,7 @@ from bhd_lerobot.control import kernels
 from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.sim import frames
 from bhd_lerobot.tasks.pick import PickConfig, PickTask

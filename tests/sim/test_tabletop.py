@@ -13,7 +13,7 @@ from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import COLOURS, MAX_OBJECTS, TableObject, TableScene, Variation
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import SimulationError

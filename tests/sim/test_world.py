@@ -9,7 +9,7 @@ import pytest
 from bhd_lerobot.bodies.arenas import random_arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, SimulationError
 from bhd_lerobot.sim.lidar import Lidar

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, MAX_OBJECTS, OBJECT_FIELDS, TableObject, TableScene
 from bhd_lerobot.bodies.truth import ArmTruth
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.parse import parse as parse_configuration
 from bhd_lerobot.policies.language.instruction import parse

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, TableScene, Variation
 from bhd_lerobot.bodies.truth import ArmTruth
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.commands import Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask

@@ -21,7 +21,7 @@ from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.parts.latency import MAX_LATENCY
 from bhd_lerobot.rollout.episode import EpisodeLoop

@@ -10,7 +10,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.teleoperators.bhd_brain import BhdBrain
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
+from bhd_lerobot.bodies.ur import MAX_OPENING
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.errors import ConfigError
@@ -19,10 +19,10 @@ from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
 from bhd_lerobot.realtime.estop import KEYS as ESTOP_KEYS
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.parts.names import TOOL_NAMES
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5
 from bhd_lerobot.rollout.marks import TELEOP_KEYS
 from bhd_lerobot.teleoperators.bhd_keyboard_arm import BhdKeyboardArm
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import BhdKeyboardArmConfig

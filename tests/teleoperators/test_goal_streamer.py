@@ -8,8 +8,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.config_ur import UR5Config
+from bhd_lerobot.robots.ur import UR5
 from bhd_lerobot.teleoperators.bhd_brain import BhdBrain, GoalStreamer
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
 

@@ -12,7 +12,7 @@ from bhd_lerobot.options import parse as configuration
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import make_robot
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import command, parse_aggregation, read_stages

@@ -16,7 +16,7 @@ from bhd_lerobot.policies.perception.configuration_perception import PerceptionC
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.registry import check_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.host import describe
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.pick import PickConfig

@@ -66,7 +66,7 @@ def for_identification(config: Any) -> Any:
     if not hasattr(config, "measured"):
         raise ConfigError(
             f"robot.type is {config.type!r}, whose servos are known; those of arms from a file are identified: choose "
-            "so101, or arm with --robot.mjcf=FILE."
+            "arm with --robot.mjcf=FILE, or one of your own that has a file."
         )
     fps = max(fps for fps in range(1, _FPS + 1) if config.control_hz % fps == 0)
     return replace(config, fps=fps, action_space="joint")

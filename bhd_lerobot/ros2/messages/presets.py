@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterable, Mapping
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
+from bhd_lerobot.bodies.ur import JOINTS as UR_JOINTS
+from bhd_lerobot.bodies.ur import MODELS
 from bhd_lerobot.ros2.messages.images import IMAGE
 from bhd_lerobot.ros2.messages.mapping import FieldConfig, ImageConfig, MappingConfig, TopicFields, fields_of
 from bhd_lerobot.ros2.messages.table import (
@@ -63,15 +64,14 @@ def turtlebot3(
     return MappingConfig(observation, action, images)
 
 
-def ur5() -> MappingConfig:
-    """Return the mapping of a UR5 with a gripper, as `bhd-data export` writes it: joints by name."""
-    joints = ur5_body().limits.names
-    speeds = [f"{name.removesuffix('.pos')}.vel" for name in joints]
+def ur() -> MappingConfig:
+    """Return the mapping of a UR with a gripper, as `bhd-data export` writes it: joints by name."""
+    joints, speeds = ([f"{name}.{end}" for name in (*UR_JOINTS, "gripper")] for end in ("pos", "vel"))
     return MappingConfig(
         observation=entries("/joint_states", JOINTS, (*joints, *speeds)),
         action=entries("/joint_command", JOINTS, joints),
     )
 
 
-PRESETS: Mapping[str, Callable[[], MappingConfig]] = {"turtlebot3": turtlebot3, "ur5": ur5}
+PRESETS: Mapping[str, Callable[[], MappingConfig]] = {"turtlebot3": turtlebot3, **dict.fromkeys(MODELS, ur)}
 """What makes the mapping of a robot, by its type."""

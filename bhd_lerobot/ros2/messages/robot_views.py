@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, ArmChain, Body, Drive
 from bhd_lerobot.bodies.registry import body_of
+from bhd_lerobot.bodies.ur import MODELS
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.ros2.messages.base import BaseNoise
 from bhd_lerobot.ros2.messages.table import ARM_FRAME, FOOTPRINT_FRAME, IMU_FRAME, SCAN_FRAME, TOOL_FRAME
@@ -33,7 +34,7 @@ def robot_view(robot_type: str | None, recording: Mapping[str, Any] | None = Non
     if robot_type == "turtlebot3":
         robot = (recording or {}).get("robot")
         return _turtlebot3(body, is_simulated=isinstance(robot, dict) and robot.get("type") == robot_type)
-    return _ur5(body) if robot_type == "ur5" else RobotView(lidar=body.lidar)
+    return _ur(body) if robot_type in MODELS else RobotView(lidar=body.lidar)
 
 
 def _turtlebot3(body: Body, *, is_simulated: bool) -> RobotView:
@@ -79,7 +80,7 @@ def _base_noise(drive: Drive) -> BaseNoise:
     )
 
 
-def _ur5(body: Body) -> RobotView:
+def _ur(body: Body) -> RobotView:
     chain = body.need(Arm).chain
     model = ElementTree.fromstring(body.mjcf)
     camera = _find(model, "camera", "wrist")

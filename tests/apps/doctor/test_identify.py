@@ -13,7 +13,7 @@ from bhd_lerobot.cli.doctor import main
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.arm import SO101
 from bhd_lerobot.robots.config_arm import SO101Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from tests.cases import each_case
 from tests.robots.device.support import Bus
 from tests.robots.device.support import bus as bus  # noqa: PLC0414

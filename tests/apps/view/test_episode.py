@@ -10,7 +10,7 @@ from bhd_lerobot.apps.view.packing import pack, unpack
 from bhd_lerobot.bodies.fetch_scene import make_fetch_scene
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.features import PHYSICS_STATE
 from tests.cases import each_case

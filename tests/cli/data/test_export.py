@@ -13,7 +13,7 @@ from rosbags.interfaces import QosDurability
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5 as ur5_body
+from bhd_lerobot.bodies.ur import ur5 as ur5_body
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format.columns import read_episode

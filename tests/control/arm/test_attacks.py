@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import HELD, OBSTACLE, Capsule
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.clearance import fill_geometry, new_geometries
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.cerebellum import Cerebellum

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.geometry.collision import CollisionModel
 
 ARM = ur5()

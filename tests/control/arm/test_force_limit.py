@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.force_limit import explain_force, feel, forget_force
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import HELD, Capsule, Placement
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.held import follow_gripper, held_capsule
 from bhd_lerobot.control.geometry.collision import CollisionModel

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.setpoints import follow_setpoint, leave_setpoints, take_setpoint
 from bhd_lerobot.control.kernels import as_objects

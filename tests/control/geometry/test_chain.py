@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.body import HELD, Capsule, Placement
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.clearance import fill_geometry
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.geometry.chain import find_distances, find_frames, find_jacobian, find_torques, solve

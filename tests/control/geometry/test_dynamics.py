@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.impedance import ImpedanceController
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics, _parse
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -113,7 +113,7 @@ def test_the_damped_mobility_has_an_inverse_in_a_singular_posture() -> None:
     ("body", "message"),
     [
         *((at_home_open(opening), "opening") for opening in (-0.01, 0.1, float("nan"))),
-        (replace(ARM, mjcf=ARM.mjcf.replace('name="elbow" class="large"', 'name="knee" class="large"')), "it needs"),
+        (replace(ARM, mjcf=ARM.mjcf.replace('name="elbow" class="hinge"', 'name="knee" class="hinge"')), "it needs"),
         (replace(ARM, mjcf="<mujoco"), "not valid"),
         (replace(ARM, mjcf=ARM.mjcf.replace('<site name="tool"', '<site name="tip"')), "has no site 'tool'"),
     ],

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import ArmChain, Placement
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import MODELS, ur, ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics, UrGeometry
 from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm
@@ -25,6 +25,7 @@ ALPHA = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 HOME = np.array(ARM.arm.home[:6])
 KINEMATICS = ArmKinematics(CHAIN, ARM.limits)
 TILTED = ArmKinematics(dataclasses.replace(CHAIN, tool=Placement((0.03, -0.02, 0.15))), ARM.limits)
+OTHERS = [ArmKinematics(one.arm.chain, one.limits) for one in map(ur, MODELS) if one.name != ARM.name]
 TURN = 2 * math.pi
 ANGLE = st.floats(-math.pi, math.pi) | st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi, -math.pi, 1e-7])
 POSTURE = arrays(np.float64, (6,), elements=ANGLE)
@@ -76,7 +77,7 @@ def test_jacobian_is_the_derivative() -> None:
 
 
 @pytest.mark.law
-@pytest.mark.parametrize("kinematics", [KINEMATICS, TILTED])
+@pytest.mark.parametrize("kinematics", [KINEMATICS, TILTED, *OTHERS])
 def test_every_solution_reaches_the_pose_and_the_generating_posture_is_among_them(kinematics: ArmKinematics) -> None:
     determinant = np.abs(np.linalg.det(kinematics.jacobian(MANY)))
     np.testing.assert_allclose(kinematics.manipulability(MANY), determinant, atol=1e-14)

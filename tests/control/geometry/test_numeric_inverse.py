@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.body import Arm, Limits, Placement
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import MODELS, ur, ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm
@@ -81,11 +81,12 @@ def test_the_pose_of_every_posture_is_reached_from_anywhere(joints: int) -> None
 
 
 @pytest.mark.law
-def test_the_ur5_is_solved_as_by_its_closed_form() -> None:
-    body = ur5()
+@pytest.mark.parametrize("name", MODELS)
+def test_a_ur_is_solved_as_by_its_closed_form(name: str) -> None:
+    body = ur(name)
     closed = ArmKinematics(body.need(Arm).chain, body.limits)
     numeric = NumericInverse(closed, closed.lower, closed.upper)
-    drawn = np.random.default_rng(2).uniform(-np.pi, np.pi, (2, 200, 6))
+    drawn = np.random.default_rng(2).uniform(-np.pi, np.pi, (2, 100, 6))
     for q, start in zip(*drawn, strict=True):
         pose = closed.tool(q)
         found, misses = next(numeric.search(pose, start))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.baselines import NoopConfig
@@ -28,7 +28,7 @@ from bhd_lerobot.policies.navigation.avoidance import AvoidanceConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
 from bhd_lerobot.registry import check_brain, drives, make_brain, robot_of_brain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from tests.cases import each_case
 
 BASE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))

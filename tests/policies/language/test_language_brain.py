@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS, TableObject
-from bhd_lerobot.bodies.ur5 import MAX_OPENING
+from bhd_lerobot.bodies.ur import MAX_OPENING
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.skills import Plan, SceneObject, Skill, TextPlanner, make_plan

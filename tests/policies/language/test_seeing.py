@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import COLOURS, TableObject
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError, InstructionError, PerceptionError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures

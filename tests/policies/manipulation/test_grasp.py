@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.policies.manipulation.grasp import SeenObject, neutral_yaw, plan_grasp, pointing_down, read_objects
 from tests.cases import each_case

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.tabletop import TableObject
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.commands import CommandResult, Goals, ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.pick import PickBrain, PickBrainConfig
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from bhd_lerobot.tasks.task import Event, episode_seed

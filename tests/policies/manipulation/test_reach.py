@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import RobotFeatures

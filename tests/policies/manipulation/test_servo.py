@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
-from bhd_lerobot.bodies.ur5 import MAX_OPENING, ur5
+from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.servo import PickServoBrain, PickServoConfig, ReachServoBrain, ServoConfig

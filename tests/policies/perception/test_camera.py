@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import SCENE_CAMERA, TableObject, TableScene
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.policies.perception.camera import Projection
 from bhd_lerobot.sim.camera import Camera

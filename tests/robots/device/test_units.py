@@ -14,7 +14,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.device.process import Speed
 from bhd_lerobot.robots.device.units import Motor, unit_of
 from tests.cases import each_case

@@ -12,7 +12,7 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.control.plant import Plant, PlantReading, SafetyStatus
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.checked_plant import CheckedPlant, plant_class
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.parts.arm import ArmPart

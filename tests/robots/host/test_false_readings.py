@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.control.messages import Mode
-from bhd_lerobot.robots.config_ur5 import UR5Config
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.config_ur import UR5Config
+from bhd_lerobot.robots.ur import UR5
 from tests.robots.host import lying_arm
 from tests.robots.host.support import mode, relaxed, unique
 from tests.waiting import until

@@ -8,7 +8,7 @@ from typing import Any
 
 from bhd_lerobot.robots.config import BhdRobotConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.checked_plant import Unconnected
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.process import LiveSpec

@@ -9,11 +9,11 @@ from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import Limit, Mode, Watchdog
 from bhd_lerobot.realtime.grid import TickGrid
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import LIMITS, StatePublisher, published_dtype, raised
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5
 
 F = 20  # ticks in a frame, of both robots
 

@@ -16,9 +16,9 @@ from bhd_lerobot.control.commands import BrainCommand, CommandResult, GoalPhase,
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.planning_link import PlanningLink
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5
 from tests.forks import Fork
 from tests.robots.host.support import States, is_gone, mode, relaxed, unique, watchdog_count
 from tests.waiting import until

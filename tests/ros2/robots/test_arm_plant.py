@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.network import Ros2Config

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bhd_lerobot.bodies.ur5 import ur5
+from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.cli import ros2, serve
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.serve.bridge import BridgeConfig

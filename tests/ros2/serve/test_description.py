@@ -8,6 +8,7 @@ import pinocchio
 import pytest
 
 from bhd_lerobot.bodies.registry import body_of
+from bhd_lerobot.bodies.ur import MODELS
 from bhd_lerobot.ros2.messages.robot_views import robot_view
 from bhd_lerobot.ros2.serve.description import urdf
 from bhd_lerobot.sim.description import parts_of
@@ -20,8 +21,9 @@ def described(robot_type: str) -> tuple[str, mujoco.MjModel]:
 
 
 @pytest.mark.law
-def test_an_arm_moves_and_weighs_as_the_simulated_one() -> None:
-    text, simulated = described("ur5")
+@pytest.mark.parametrize("robot_type", MODELS)
+def test_an_arm_moves_and_weighs_as_the_simulated_one(robot_type: str) -> None:
+    text, simulated = described(robot_type)
     read = pinocchio.buildModelFromXML(text)
     data, state = read.createData(), mujoco.MjData(simulated)
     random = np.random.default_rng(0)
@@ -38,7 +40,7 @@ def test_an_arm_moves_and_weighs_as_the_simulated_one() -> None:
         np.testing.assert_allclose(bias, state.qfrc_bias[: read.nv], atol=1e-6)
 
 
-@pytest.mark.parametrize("robot_type", ["turtlebot3", "ur5"])
+@pytest.mark.parametrize("robot_type", ["turtlebot3", *MODELS])
 def test_masses_frames_and_solids_are_all_there(robot_type: str) -> None:
     text, simulated = described(robot_type)
     view = robot_view(robot_type)

@@ -7,28 +7,67 @@ import mujoco
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.tabletop import TableScene
-from bhd_lerobot.bodies.ur5 import JOINTS, ur5
+from bhd_lerobot.bodies.ur import JOINTS, MODELS, ur, ur5
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 
-BODY = ur5()
-CHAIN = BODY.arm.chain
-TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
-LAG = np.array(BODY.arm.servo_damping) / np.array(BODY.arm.servo_stiffness)  # velocity feed-forward of the servos [s]
-DT = 1 / BODY.physics_hz
+DT = 1 / ur5().physics_hz
 FINGERS = slice(6, 8)
 PAYLOAD = (
     '<body name="payload" pos="0 0 0.150"><inertial pos="0 0 0" mass="1" diaginertia="1e-3 1e-3 1e-3"/></body>'
     '<site name="tool"'
 )
-LOADED = dataclasses.replace(BODY, mjcf=BODY.mjcf.replace('<site name="tool"', PAYLOAD))
+UR5_CENTRES = ((0, -0.02561, 0.00193), (0.2125, 0, 0.11336), (0.15, 0, 0.0265), (0, -0.0018, 0.01634),
+               (0, 0.0018, 0.01634), (0, 0, -0.001159))  # fmt: skip
+# Lengths a2 and a3, offsets d1, d4, d5 and d6; masses; centres of mass; torques; speeds [deg/s]; payload.
+PUBLISHED = {
+    "ur3e": (
+        (0.24355, 0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
+        (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
+        ((0, -0.02, 0), (0.13, 0, 0.1157), (0.05, 0, 0.0238), (0, 0, 0.01), (0, 0, 0.01), (0, 0, -0.02)),
+        (56, 56, 28, 12, 12, 12),
+        (180, 180, 180, 360, 360, 360),
+        3,
+    ),
+    "ur5": (
+        (0.425, 0.39225, 0.089159, 0.10915, 0.09465, 0.0823),
+        (3.7, 8.393, 2.33, 1.219, 1.219, 0.1879),
+        UR5_CENTRES,
+        (150, 150, 150, 28, 28, 28),
+        (180,) * 6,
+        5,
+    ),
+    "ur5e": (
+        (0.425, 0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
+        (3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
+        UR5_CENTRES,
+        (150, 150, 150, 28, 28, 28),
+        (180,) * 6,
+        5,
+    ),
+    "ur10e": (
+        (0.6127, 0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
+        (7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
+        ((0.021, 0, 0.027), (0.38, 0, 0.158), (0.24, 0, 0.068), (0, 0.007, 0.018), (0, 0.007, 0.018), (0, 0, -0.026)),
+        (330, 330, 150, 56, 56, 56),
+        (120, 120, 180, 180, 180, 180),
+        8,
+    ),
+}
 
 
-def dh_frames(q: np.ndarray) -> list[np.ndarray]:
+@pytest.fixture(scope="module", params=MODELS)
+def body(request: pytest.FixtureRequest) -> Body:
+    return ur(request.param)
+
+
+def dh_frames(body: Body, q: np.ndarray) -> list[np.ndarray]:
     """The chain's frames 0 to 6 in the base frame, each of shape (4, 4)."""
-    a, d = (0, -0.425, -0.39225, 0, 0, 0), (0.089159, 0, 0, 0.10915, 0.09465, 0.0823)
-    alpha = (90, 0, 0, 90, -90, 0)
+    a2, a3, d1, d4, d5, d6 = PUBLISHED[body.name][0]
+    a, d, alpha = (0, -a2, -a3, 0, 0, 0), (d1, 0, 0, d4, d5, d6), (90, 0, 0, 90, -90, 0)
     frames = [np.eye(4)]
     for i in range(6):
         c, s = math.cos(q[i]), math.sin(q[i])
@@ -38,14 +77,14 @@ def dh_frames(q: np.ndarray) -> list[np.ndarray]:
     return frames
 
 
-def tool_position(q: np.ndarray) -> np.ndarray:
-    flange = dh_frames(q)[6]
+def tool_position(body: Body, q: np.ndarray) -> np.ndarray:
+    flange = dh_frames(body, q)[6]
     return flange[:3, :3] @ (0, 0, 0.150) + flange[:3, 3]
 
 
 @pytest.fixture(scope="module")
-def model() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(BODY.mjcf)
+def model(body: Body) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(body.mjcf)
 
 
 @pytest.fixture
@@ -60,13 +99,15 @@ def postures(count: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.law
-def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(
+    body: Body, model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
     for q in postures(100):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
-        frames = dh_frames(q)
+        frames = dh_frames(body, q)
         np.testing.assert_allclose(data.body("gripper").xpos, frames[6][:3, 3], atol=1e-12)
-        np.testing.assert_allclose(data.site("tool").xpos, tool_position(q), atol=1e-12)
+        np.testing.assert_allclose(data.site("tool").xpos, tool_position(body, q), atol=1e-12)
         np.testing.assert_allclose(data.site("tool").xmat.reshape(3, 3), frames[6][:3, :3], atol=1e-12)
         # A joint turns about the z axis of the frame before it.
         for number, joint in enumerate(JOINTS):
@@ -74,37 +115,32 @@ def test_the_forward_kinematics_are_the_denavit_hartenberg_chain(model: mujoco.M
             np.testing.assert_allclose(data.joint(joint).xanchor, frames[number][:3, 3], atol=1e-12)
 
 
-def test_masses_and_centres_of_mass_are_the_published_ones(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    masses = (3.7, 8.393, 2.33, 1.219, 1.219, 0.1879)
-    centres = np.array(
-        [
-            (0, -0.02561, 0.00193),
-            (0.2125, 0, 0.11336),
-            (0.15, 0, 0.0265),
-            (0, -0.0018, 0.01634),
-            (0, 0.0018, 0.01634),
-            (0, 0, -0.001159),
-        ]
-    )
+def test_masses_and_centres_of_mass_are_the_published_ones(
+    body: Body, model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
+    _, masses, centres, *_ = PUBLISHED[body.name]
     for q in postures(3):
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
-        for number, (joint, frame) in enumerate(zip(JOINTS, dh_frames(q)[1:], strict=True)):
-            body = model.joint(joint).bodyid[0]
-            assert model.body_mass[body] == masses[number]
+        for number, (joint, frame) in enumerate(zip(JOINTS, dh_frames(body, q)[1:], strict=True)):
+            link = model.joint(joint).bodyid[0]
+            assert model.body_mass[link] == masses[number]
             at = frame[:3, :3] @ centres[number] + frame[:3, 3]
-            np.testing.assert_allclose(data.xipos[body], at, atol=1e-9)
+            np.testing.assert_allclose(data.xipos[link], at, atol=1e-9)
     assert model.body_subtreemass[model.body("gripper").id] == pytest.approx(0.9)
 
 
-def test_the_collision_geometry_is_that_of_the_chains_capsules(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def test_the_collision_geometry_is_that_of_the_chains_capsules(
+    body: Body, model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
+    chain = body.arm.chain
     q = postures(1, 5)[0]
     q[FINGERS] = 0.0425
     data.qpos[:] = q
     mujoco.mj_forward(model, data)
-    frames = dh_frames(q)
+    frames = dh_frames(body, q)
     checked = []
-    for capsule in CHAIN.capsules:
+    for capsule in chain.capsules:
         frame = frames[capsule.frame]
         ends = np.array([capsule.start, capsule.end]) @ frame[:3, :3].T + frame[:3, 3]
         geom = data.geom(capsule.name)
@@ -117,18 +153,18 @@ def test_the_collision_geometry_is_that_of_the_chains_capsules(model: mujoco.MjM
                 along = ends[1] - ends[0]
                 share = np.clip((points - ends[0]) @ along / (along @ along), 0, 1)
                 distance = np.linalg.norm(points - ends[0] - share[:, None] * along, axis=1)
-                assert distance.max() < capsule.radius + CHAIN.min_distance
+                assert distance.max() < capsule.radius + chain.min_distance
             continue
         assert size[0] == capsule.radius
         mine = np.array([geom.xpos - size[1] * axis, geom.xpos + size[1] * axis])
         assert min(np.abs(mine - ends).max(), np.abs(mine[::-1] - ends).max()) < 1e-9
         checked.append(capsule.name)
-    assert len(checked) == len(CHAIN.capsules) - 2
+    assert len(checked) == len(chain.capsules) - 2
 
 
-def clear_postures(count: int, margin: float = 0.05) -> np.ndarray:
+def clear_postures(body: Body, count: int, margin: float = 0.05) -> np.ndarray:
     """Random joint angles at which the arm is clear of itself and of the table, shape (count, 6)."""
-    world = World(BODY)
+    world = World(body)
     table = Tabletop(world)
     model = world.copy_model(0)
     data = mujoco.MjData(model)
@@ -145,53 +181,55 @@ def clear_postures(count: int, margin: float = 0.05) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def clear() -> np.ndarray:
+def clear(body: Body) -> np.ndarray:
     # At full reach a payload bends the servos most.
     stretched = np.array([0.3, -0.02, 0.0, -math.pi / 2, 0.0, 0.0])
-    return np.vstack([stretched, clear_postures(13)])
+    return np.vstack([stretched, clear_postures(body, 13)])
 
 
-def loaded_world(q: np.ndarray) -> tuple[World, Tabletop, np.ndarray]:
+def loaded_world(body: Body, q: np.ndarray) -> tuple[World, Tabletop, np.ndarray]:
     """Simulations that hold 1 kg, which no gravity compensation carries, and their joints' live torques."""
-    world = World(LOADED, len(q))
+    loaded = dataclasses.replace(body, mjcf=body.mjcf.replace('<site name="tool"', PAYLOAD))
+    world = World(loaded, len(q))
     table = Tabletop(world)
     table.place([TableScene("", (), (*row, 0.05)) for row in q])
     world.model_field("body_gravcomp")[:, world.model.body("payload").id] = 0.0
     return world, table, world.derived("qfrc_actuator")
 
 
-def test_the_servos_hold_a_payload_within_half_a_millimetre(clear: np.ndarray) -> None:
-    world, table, torque = loaded_world(clear)
-    wanted = np.array([tool_position(q) for q in clear])
+def test_the_servos_hold_a_payload_within_half_a_millimetre(body: Body, clear: np.ndarray) -> None:
+    world, table, torque = loaded_world(body, clear)
+    wanted = np.array([tool_position(body, q) for q in clear])
     largest = np.zeros(6)
     for _ in range(500):
         world.step()
         largest = np.maximum(largest, np.abs(torque[:, :6]).max(axis=0))
     sag = np.linalg.norm(table.tool_pose[:, :3] - wanted, axis=1)
-    assert 0.0003 < sag.max() < 0.0005  # and the payload is felt
+    assert 0.0002 < sag.max() < 0.0005  # and the payload is felt
     assert np.abs(world.qvel[:, :6]).max() < 1e-6  # nothing rings
-    assert (largest < TORQUE).all()
+    assert (largest < body.limits.effort[:6]).all()
 
 
-def test_the_servos_follow_with_velocity_feed_forward_and_within_their_torque(clear: np.ndarray) -> None:
-    world, table, torque = loaded_world(clear)
+def test_the_servos_follow_with_velocity_feed_forward_and_within_their_torque(body: Body, clear: np.ndarray) -> None:
+    world, table, torque = loaded_world(body, clear)
+    lag = np.array(body.arm.servo_damping[:6]) / np.array(body.arm.servo_stiffness[:6])  # velocity feed-forward [s]
     amplitude, rate = 0.12, 2 * math.pi * 0.8
     untouched = np.ones(len(clear), np.bool_)
     for k in range(1, 626):
         phase = rate * k * DT
         swing, speed = amplitude * (1 - math.cos(phase)) / 2, amplitude * rate * math.sin(phase) / 2
-        world.ctrl[:, :6] = clear + swing + LAG[:6] * speed
+        world.ctrl[:, :6] = clear + swing + lag * speed
         world.step()
         untouched &= ~(table.arm_on_table | table.self_contact)
         error = np.abs(world.qpos[untouched, :6] - clear[untouched] - swing)
         assert error.max() < 0.002
-        assert (np.abs(torque[untouched, :6]) < TORQUE).all()
+        assert (np.abs(torque[untouched, :6]) < body.limits.effort[:6]).all()
     assert untouched.sum() > 5
 
 
-def test_a_small_step_is_answered_at_once_and_without_ringing(clear: np.ndarray) -> None:
+def test_a_small_step_is_answered_at_once_and_without_ringing(body: Body, clear: np.ndarray) -> None:
     for joint in range(6):
-        world, _, _ = loaded_world(clear[:6])
+        world, _, _ = loaded_world(body, clear[:6])
         world.step(300)
         start = world.qpos[:, joint].copy()
         world.ctrl[:, joint] += 1e-3
@@ -204,26 +242,30 @@ def test_a_small_step_is_answered_at_once_and_without_ringing(clear: np.ndarray)
 
 
 @pytest.mark.parametrize("actuation", ["position", "torque"])
-def test_the_actuators_are_those_of_the_arm(actuation: str) -> None:
-    body = ur5(actuation=actuation)  # type: ignore[arg-type]
+@pytest.mark.parametrize("name", MODELS)
+def test_the_actuators_are_those_of_the_arm(name: str, actuation: str) -> None:
+    body = ur(name, actuation=actuation)  # type: ignore[arg-type]
+    *_, torques, speeds, payload = PUBLISHED[name]
+    assert body.limits.velocity[:6] == pytest.approx(np.radians(speeds), abs=0)
+    assert (body.limits.effort[:6], body.arm.payload) == (torques, payload)
     model = World(body).model
-    for number, name in enumerate(body.arm.actuators):
-        actuator = model.actuator(name)
+    for number, own in enumerate(body.arm.actuators):
+        actuator = model.actuator(own)
         assert actuator.id == number
         assert actuator.forcerange.tolist() == [-body.limits.effort[number], body.limits.effort[number]]
-        if actuation == "position" or name == "gripper":
+        if actuation == "position" or own == "gripper":
             stiffness, damping = body.arm.servo_stiffness[number], body.arm.servo_damping[number]
             assert actuator.gainprm[0] == stiffness
             assert actuator.biasprm[:3].tolist() == [0, -stiffness, -damping]
         else:
             assert (actuator.gainprm[0], actuator.biasprm.any()) == (1, False)
-    for joint, torque in zip(JOINTS, TORQUE, strict=True):
+    for joint, torque in zip(JOINTS, torques, strict=True):
         assert model.jnt_actfrcrange[model.joint(joint).id].tolist() == [-torque, torque]
         assert model.joint(joint).range.tolist() == [-2 * math.pi, 2 * math.pi]
 
 
-def test_the_gripper_opens_and_closes_with_its_fingers_in_step(clear: np.ndarray) -> None:
-    world = World(BODY, 8)
+def test_the_gripper_opens_and_closes_with_its_fingers_in_step(body: Body, clear: np.ndarray) -> None:
+    world = World(body, 8)
     table = Tabletop(world)
     table.place([TableScene("", (), (*q, 0.0)) for q in clear[:8]])
     for wanted in (0.085, 0.03, 0.0):
@@ -251,3 +293,8 @@ def test_the_pads_inner_faces_are_the_opening_apart(model: mujoco.MjModel, data:
         half = model.geom("pad_left").size[1]
         assert left + half == pytest.approx(-opening / 2, abs=1e-12)
         assert right - half == pytest.approx(opening / 2, abs=1e-12)
+
+
+def test_an_arm_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(ConfigError, match=r"Unknown arm 'ur5a'.*Valid: ur10e, ur3e, ur5, ur5e"):
+        ur("ur5a")

@@ -1,4 +1,4 @@
-"""The UR5 as LeRobot sees it: features, bad actions, stops, goals beside setpoints, tool space, noise, options."""
+"""A UR as LeRobot sees it: features, bad actions, stops, goals beside setpoints, tool space, noise, options."""
 
 import math
 
@@ -8,18 +8,18 @@ import pytest
 from bhd_lerobot.bodies.tabletop import TableScene, Variation
 from bhd_lerobot.control.commands import BrainCommand
 from bhd_lerobot.errors import CommandRefusedError, ConfigError, RenderingError
-from bhd_lerobot.robots.config_ur5 import UR5Config
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.host.simulation import Simulation
-from bhd_lerobot.robots.ur5 import UR5
+from bhd_lerobot.robots.ur import UR5, UR3e, UR5e, UR10e
 from tests.cases import each_case
 
 FIRST = np.zeros(1, np.intp)
 DOWN = (0.0, 1.0, 0.0, 0.0)
 
 
-def make(tmp_path, **options) -> UR5:
-    return UR5(UR5Config(calibration_dir=tmp_path, **options))
+def make(tmp_path, kind=UR5, **options) -> UR5:
+    return kind(kind.config_class(calibration_dir=tmp_path, **options))
 
 
 @pytest.fixture
@@ -33,11 +33,14 @@ def stay(robot) -> dict[str, float]:
     return dict(zip(robot.action_names, robot.host.to_action(robot.host.cerebellum.command)[0].tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("space", "scene"), [("joint", "empty"), ("tool", "pick")])
-def test_it_keeps_the_contract_of_a_lerobot_robot(tmp_path, space, scene):
-    with make(tmp_path, action_space=space) as robot:
+@pytest.mark.parametrize(
+    ("kind", "space", "scene"),
+    [(UR5, "joint", "empty"), *((kind, "tool", "pick") for kind in (UR5, UR3e, UR5e, UR10e))],
+)
+def test_it_keeps_the_contract_of_a_lerobot_robot(tmp_path, kind, space, scene):
+    with make(tmp_path, kind, action_space=space) as robot:
         action = stay(robot)
-    assert check_robot(lambda: make(tmp_path, action_space=space, scene=scene), action, adversarial=True) == ()
+    assert check_robot(lambda: make(tmp_path, kind, action_space=space, scene=scene), action, adversarial=True) == ()
 
 
 @pytest.mark.law
@@ -132,8 +135,9 @@ def test_camera_images_where_there_is_opengl(tmp_path):
     assert not np.array_equal(seen["scene"], seen["wrist"])
 
 
-def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path):
-    options = {"control": "impedance", "action_space": "tool"}
+@pytest.mark.parametrize("kind", [UR5, UR3e, UR5e, UR10e])
+def test_an_impedance_robot_keeps_the_contract_and_follows_tool_poses(tmp_path, kind):
+    options = {"kind": kind, "control": "impedance", "action_space": "tool"}
     with make(tmp_path, **options) as robot:
         action = stay(robot)
         action["tool_z.pos"] -= 0.05
