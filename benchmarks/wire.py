@@ -65,7 +65,9 @@ def wire_of_arm(arm: Arm, hz: int) -> tuple[Array, ...]:
     effort = np.asarray(limits.effort[:-1])
     change = (np.asarray(limits.velocity) + 2 * lead * np.asarray(limits.stop_deceleration)) / hz
     bend = np.asarray(limits.stop_deceleration) * (1 / hz + 2 * lead) / hz
-    lower, upper = np.asarray(limits.lower) - 1e-2, np.asarray(limits.upper) + 1e-2
+    # A joint that is led by its speed times a time passes the end of its range by no more than this while it stops.
+    beyond = np.maximum(limits.stop_deceleration, limits.acceleration) * lead**2 / 2 + 1e-3
+    lower, upper = np.asarray(limits.lower) - beyond, np.asarray(limits.upper) + beyond
     if arm.actuation == "torque":
         lower[:-1], upper[:-1], change[:-1] = -effort, effort, effort / 0.1 / hz
         bend[:-1] = np.inf
