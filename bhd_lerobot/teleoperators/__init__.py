@@ -8,7 +8,7 @@ __all__ = [
     "config_bhd_keyboard_arm",
     "config_bhd_keyboard_base",
     "config_keyboard",
-    "errors",
     "keyboard",
+    "plain",
     "targets",
 ]

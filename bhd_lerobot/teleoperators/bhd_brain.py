@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from lerobot.teleoperators.teleoperator import Teleoperator
-from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body, Rates
@@ -18,7 +16,7 @@ from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_pri
 from bhd_lerobot.registry import ROBOTS, action_names_of, brains_for, drives, make_brain
 from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_brain import BhdBrainConfig
-from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
+from bhd_lerobot.teleoperators.plain import PlainTeleoperator, TeleoperatorConfigError
 
 
 class GoalStreamer:
@@ -66,7 +64,7 @@ class GoalStreamer:
         return controller.command[0].copy(), [name for name in refused if name not in ended] + ended
 
 
-class BhdBrain(Teleoperator):
+class BhdBrain(PlainTeleoperator):
     """A brain in place of a person: its actions follow from what the robot in this process last observed.
 
     LeRobot asks a teleoperator for actions and shows it nothing; this one observes the simulated robot that is
@@ -99,19 +97,9 @@ class BhdBrain(Teleoperator):
         return dict.fromkeys(names, float)
 
     @property
-    def feedback_features(self) -> dict[str, type]:
-        """It takes no feedback."""
-        return {}
-
-    @property
     def is_connected(self) -> bool:
         """Whether `connect` was called."""
         return self._is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        """A brain needs no calibration."""
-        return True
 
     def connect(self, calibrate: bool = True) -> None:
         """Get ready; the robot may be connected later.
@@ -119,15 +107,8 @@ class BhdBrain(Teleoperator):
         Raises:
             DeviceAlreadyConnectedError: it is connected.
         """
-        if self._is_connected:
-            raise DeviceAlreadyConnectedError(f"{self} is already connected.")
+        self.check_new()
         self._is_connected = True
-
-    def calibrate(self) -> None:
-        """Nothing to calibrate."""
-
-    def configure(self) -> None:
-        """Nothing to configure beyond the configuration."""
 
     def get_action(self) -> dict[str, Any]:
         """Return what the brain wants, given the robot's last observation.
@@ -137,8 +118,7 @@ class BhdBrain(Teleoperator):
             TeleoperatorConfigError: there is no robot to drive, several and `robot_id` does not choose, or one that the
                 brain does not drive.
         """
-        if not self._is_connected:
-            raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
+        self.check_connected()
         try:
             return self._next_action()
         except ConfigError as error:
@@ -200,9 +180,6 @@ class BhdBrain(Teleoperator):
         command = np.zeros((1, len(body.limits.names)))  # a base stands meanwhile
         command[0, : len(reference)] = reference
         return robot.host.to_action(command)[0], results
-
-    def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Do nothing: a brain feels no feedback."""
 
     def disconnect(self) -> None:
         """Forget the robot. May be called twice."""

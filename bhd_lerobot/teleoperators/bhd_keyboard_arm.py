@@ -11,8 +11,8 @@ from bhd_lerobot.bodies.registry import body_with
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.robot import BhdRobot, connected_robots
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import MAX_SPEED, MAX_TURN_SPEED, BhdKeyboardArmConfig
-from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
 from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator, say
+from bhd_lerobot.teleoperators.plain import TeleoperatorConfigError
 from bhd_lerobot.teleoperators.targets import POSE_NAMES, JointTarget, Target, ToolTarget, joint_names
 
 GRIPPER = "gripper.pos"

@@ -4,14 +4,10 @@ import sys
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
-
-from lerobot.teleoperators.teleoperator import Teleoperator
-from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.realtime.keys import KeySource, key_source
 from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
-from bhd_lerobot.teleoperators.errors import TeleoperatorConfigError
+from bhd_lerobot.teleoperators.plain import PlainTeleoperator, TeleoperatorConfigError
 
 FASTER, SLOWER = 1.1, 0.9
 """Factors of a speed, for each press of a key that changes it."""
@@ -22,7 +18,7 @@ def say(text: str) -> None:
     print(f"\x1b[K{text}" if sys.stderr.isatty() else text, file=sys.stderr, flush=True)
 
 
-class KeyboardTeleoperator(Teleoperator):
+class KeyboardTeleoperator(PlainTeleoperator):
     """A teleoperator whose keys come from the terminal in whose foreground the program runs, also over SSH.
 
     A key is followed until another is pressed, and for `config.hold_s` at most. Every key without a meaning stops, so
@@ -71,22 +67,10 @@ class KeyboardTeleoperator(Teleoperator):
         now = self._clock()
         self._events.extend((now, key) for key in keys.decode("ascii", "replace"))
 
-    # --- LeRobot's lifecycle -----------------------------------------------------------------------------------------
-
-    @property
-    def feedback_features(self) -> dict[str, type]:
-        """It takes no feedback."""
-        return {}
-
     @property
     def is_connected(self) -> bool:
         """Whether it reads the terminal."""
         return self._source is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        """A keyboard needs no calibration."""
-        return True
 
     def connect(self, calibrate: bool = True) -> None:
         """Take the terminal, and print to standard error what the keys do.
@@ -95,8 +79,7 @@ class KeyboardTeleoperator(Teleoperator):
             DeviceAlreadyConnectedError: it is connected.
             TeleoperatorConfigError: standard input is no terminal that this program has to itself.
         """
-        if self.is_connected:
-            raise DeviceAlreadyConnectedError(f"{self} is already connected.")
+        self.check_new()
         source = key_source()
         if source is None:
             raise TeleoperatorConfigError(
@@ -107,24 +90,6 @@ class KeyboardTeleoperator(Teleoperator):
         source.subscribe(self._on_keys)
         self._source = source
         say(self.help)
-
-    def calibrate(self) -> None:
-        """Nothing to calibrate."""
-
-    def configure(self) -> None:
-        """Nothing to configure beyond the configuration."""
-
-    def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Do nothing: a keyboard gives no feedback."""
-
-    def check_connected(self) -> None:
-        """Check that `connect` was called.
-
-        Raises:
-            DeviceNotConnectedError: it was not.
-        """
-        if not self.is_connected:
-            raise DeviceNotConnectedError(f"{self} is not connected. Call connect() first.")
 
     def disconnect(self) -> None:
         """Give the terminal back. May be called twice."""
