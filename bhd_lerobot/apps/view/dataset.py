@@ -4,23 +4,20 @@ import hashlib
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from bhd_lerobot.apps.view.download import to_csv, to_video
 from bhd_lerobot.apps.view.episode import packed_episode
 from bhd_lerobot.apps.view.marking import mark_episode
 from bhd_lerobot.datasets.edit.mark import possible_outcomes
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.datasets.format.columns import NUMBERS, in_order
+from bhd_lerobot.datasets.format.columns import episode_frames, row_of
 from bhd_lerobot.datasets.format.episode_table import PREFIX
-from bhd_lerobot.datasets.format.expected import wrong_values
-from bhd_lerobot.datasets.format.state import UNREADABLE, DatasetState, Row, corrupt, load_state, slot_of
+from bhd_lerobot.datasets.format.state import DatasetState, Row, corrupt, load_state, slot_of
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.storage.places import check_inside
@@ -104,7 +101,7 @@ class ViewedDataset:
             if key in self._packed:
                 self._packed.move_to_end(key)
                 return self._packed[key]
-            row = _row(content.state, index)
+            row = row_of(content.state, index)
             packed = packed_episode(content.state, row, _table(content.state, row))
             self._packed[key] = packed
             while sum(map(len, self._packed.values())) > _CACHED_BYTES and len(self._packed) > 1:
@@ -133,7 +130,7 @@ class ViewedDataset:
     def download(self, index: int, key: str | None) -> bytes | None:
         """Return an episode's numbers as CSV, or a camera's video of it as MP4; None if there is no such video."""
         state = self.state
-        row = _row(state, index)
+        row = row_of(state, index)
         with self._lock:
             self._check_unchanged()
             if key is None:
@@ -147,12 +144,12 @@ class ViewedDataset:
     def image(self, index: int, key: str, frame: int) -> bytes | None:
         """Return the image of a camera whose images lie in the data files, or None if there is no such image."""
         feature = self.state.info["features"].get(key)
-        row = _row(self.state, index)
+        row = row_of(self.state, index)
         if feature is None or feature["dtype"] != "image" or not 0 <= frame < row["length"]:
             return None
         with self._lock:
             self._check_unchanged()
-            stored = _table(self.state, row, [key])[key][frame].as_py() or {}
+            stored = episode_frames(self.state, row, [key])[key][frame].as_py() or {}
         if stored.get("bytes"):
             return bytes(stored["bytes"])
         if not stored.get("path"):
@@ -211,31 +208,11 @@ def _possible(state: DatasetState) -> list[str]:
     return [name for name in OUTCOMES if name in possible]
 
 
-def _row(state: DatasetState, index: int) -> Row:
-    if not 0 <= index < state.num_episodes:
-        raise DatasetError(f"There is no episode {index} in {state.root}; it has {state.num_episodes}.")
-    return state.rows[index]
-
-
-def _table(state: DatasetState, row: Row, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return an episode's columns, by default all that are neither images nor counters."""
-    path = state.root / layout.data_file(slot_of(row, "data"))
-    try:
-        if columns is None:
-            there = pq.read_schema(path).names
-            features = state.info["features"]
-            columns = [k for k in there if k in features and k not in _COUNTERS and features[k]["dtype"] != "image"]
-        table = pq.read_table(
-            path,
-            columns=list(dict.fromkeys((*columns, *NUMBERS))),
-            filters=[("episode_index", "=", row["episode_index"])],
-            page_checksum_verification=True,
-        )
-    except UNREADABLE as error:
-        raise corrupt(path, error) from error
-    if wrong := wrong_values(table):
-        raise corrupt(path, wrong)
-    return in_order(table, [row], path).select(columns)
+def _table(state: DatasetState, row: Row) -> pa.Table:
+    """Return an episode's columns that are neither images nor counters."""
+    features = state.info["features"]
+    shown = [key for key, one in features.items() if key not in _COUNTERS and one["dtype"] not in ("image", "video")]
+    return episode_frames(state, row, shown).select(shown)
 
 
 def _instruction(row: Row) -> str:

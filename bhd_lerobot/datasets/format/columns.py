@@ -13,8 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from bhd_lerobot.datasets.format.expected import is_listed
+from bhd_lerobot.datasets.format.expected import is_listed, wrong_values
 from bhd_lerobot.datasets.format.state import (
+    UNREADABLE,
     DatasetState,
     Row,
     corrupt,
@@ -121,29 +122,39 @@ def read_episode(root: Path | str, index: int) -> dict[str, NDArray]:
 
 def read_episodes(root: Path | str, indices: Iterable[int]) -> Iterator[dict[str, NDArray]]:
     """Yield every column of episodes as `read_episode` returns them, one episode at a time."""
-    root = Path(root)
-    state = load_state(root)
+    state = load_state(Path(root))
+    features = state.info["features"]
     for index in indices:
-        row = _row(state, index)
-        path = root / layout.data_file(slot_of(row, "data"))
-        try:
-            table = pq.read_table(path, filters=[("episode_index", "=", index)], page_checksum_verification=True)
-        except (OSError, pa.ArrowInvalid) as error:
-            raise corrupt(path, error) from error
-        table = in_order(table, [row], path)
+        table = episode_frames(state, row_of(state, index))
         yield {
-            key: to_numpy(table[key], tuple(state.info["features"][key]["shape"]))
-            for key in table.column_names
-            if key in state.info["features"]
+            key: to_numpy(table[key], tuple(features[key]["shape"])) for key in table.column_names if key in features
         }
 
 
-def _row(state: DatasetState, index: int) -> Row:
+def row_of(state: DatasetState, index: int) -> Row:
+    """Return the row of an episode in ``meta/episodes``."""
     count = state.num_episodes
     if not 0 <= index < count:
         valid = f", from 0 to {count - 1}" if count else ""
         raise DatasetError(f"There is no episode {index} in {state.root}; it has {count}{valid}.")
     return state.rows[index]
+
+
+def episode_frames(state: DatasetState, row: Row, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the frames of an episode in the order of their numbers, all columns or some."""
+    path = state.root / layout.data_file(slot_of(row, "data"))
+    try:
+        table = pq.read_table(
+            path,
+            columns=None if columns is None else list(dict.fromkeys((*columns, *NUMBERS))),
+            filters=[("episode_index", "=", row["episode_index"])],
+            page_checksum_verification=True,
+        )
+    except UNREADABLE as error:
+        raise corrupt(path, error) from error
+    if wrong := wrong_values(table):
+        raise corrupt(path, wrong)
+    return in_order(table, [row], path)
 
 
 def flat(column: pa.ChunkedArray) -> pa.Array:
@@ -186,9 +197,10 @@ def video_frames(path: Path, start_s: float, count: int) -> Iterator[NDArray[np.
             assert base is not None
             assert rate is not None
             half = 0.5 / float(rate)
-            container.seek(max(0, int((start_s - half) / float(base))), stream=stream)
+            first = start_s - half + (stream.start_time or 0) * float(base)
+            container.seek(max(0, int(first / float(base))), stream=stream)
             for frame in container.decode(stream):
-                if frame.pts is not None and frame.pts * float(base) < start_s - half:
+                if frame.pts is not None and frame.pts * float(base) < first:
                     continue
                 yield np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
                 found += 1

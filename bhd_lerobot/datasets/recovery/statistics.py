@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from bhd_lerobot.datasets.format import statistics
-from bhd_lerobot.datasets.format.columns import flat
+from bhd_lerobot.datasets.format.columns import flat, video_frames
 from bhd_lerobot.datasets.format.state import Row, slot_of
 from bhd_lerobot.datasets.storage import layout
 
@@ -71,19 +70,5 @@ def _images(table: pa.Table, key: str) -> Iterator[np.ndarray]:
 
 
 def _video(new: Path, key: str, row: Row) -> Iterator[np.ndarray]:
-    """Yield the images of an episode, shape (H, W, 3)."""
-    import av
-
-    kind = f"videos/{key}"
-    start, end = row[f"{kind}/from_timestamp"], row[f"{kind}/to_timestamp"]
-    step = (end - start) / row["length"]
-    with av.open(str(new / layout.video_file(key, slot_of(row, kind)))) as container:
-        stream: Any = container.streams.video[0]
-        begin = stream.start_time or 0
-        container.seek(begin + int(Fraction(start).limit_denominator(10**6) / stream.time_base), stream=stream)
-        for frame in container.decode(stream):
-            time = float((frame.pts - begin) * stream.time_base)
-            if time > end - step / 2:
-                return
-            if time > start - step / 2:
-                yield frame.to_ndarray(format="rgb24")
+    path = new / layout.video_file(key, slot_of(row, f"videos/{key}"))
+    return video_frames(path, row[f"videos/{key}/from_timestamp"], row["length"])
