@@ -4,13 +4,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from bhd_lerobot.envs import register  # noqa: F401  registers the environments
-from bhd_lerobot.envs.sequence import STREAM, EpisodeSequence
+from bhd_lerobot.envs.sequence import EpisodeSequence
 from bhd_lerobot.envs.vector import RENDER_MODES, BhdVectorEnv, info_of
-from bhd_lerobot.tasks.task import Split
 
 Observation = dict[str, Any]
 
@@ -34,14 +32,9 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         environment: the environment's name, such as ``"TurtleBot3Avoid-v0"``.
         robot: options of the robot that differ from their defaults, by name, or its configuration.
         task: the same of the task.
-        seed: the run's seed.
-        split: `train`, `validation` or `held_out`: which set of episodes.
-        cameras: whether the robot's cameras are observed.
-        obs_type: what an observation holds: one of `settings.OBS_TYPES`; all that there is if None.
-        normalise_actions: take actions in [-1, 1], mapped to the bounds.
         render_mode: ``"rgb_array"`` or None.
         first_episode: number of the first episode, if `reset` gets none; drawn at random below 2**32 if None.
-        episode_stride: how many episodes further the next one is.
+        options: others of `BhdVectorEnv`, but for `autoreset_mode`.
 
     Raises:
         ConfigError: a name or a value that cannot be honoured.
@@ -55,30 +48,12 @@ class BhdEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         robot: Any = None,
         task: Any = None,
         *,
-        seed: int = 0,
-        split: Split = "train",
-        cameras: bool | None = None,
-        obs_type: str | None = None,
-        normalise_actions: bool = False,
         render_mode: str | None = None,
         first_episode: int | None = None,
-        episode_stride: int = STREAM,
+        **options: Any,
     ) -> None:
-        self._one = BhdVectorEnv(
-            1,
-            environment,
-            robot,
-            task,
-            seed=seed,
-            split=split,
-            cameras=cameras,
-            obs_type=obs_type,
-            normalise_actions=normalise_actions,
-            render_mode=render_mode,
-            autoreset_mode=AutoresetMode.DISABLED,
-            first_episode=first_episode,
-            episode_stride=episode_stride,
-        )
+        options |= {"render_mode": render_mode, "first_episode": first_episode, "autoreset_mode": "Disabled"}
+        self._one = BhdVectorEnv(1, environment, robot, task, **options)
         self.render_mode, self.task, self.episodes = render_mode, self._one.task, self._one.episodes
         self.metadata = {**self.metadata, "render_fps": self._one.metadata["render_fps"]}
         self.action_space = self._one.single_action_space
