@@ -1,5 +1,6 @@
 """Uploading a dataset with its card, and the report of it."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING
 from bhd_lerobot.datasets.remote.listing import megabytes
 from bhd_lerobot.datasets.remote.place import check_repo_id, is_url, shown
 from bhd_lerobot.errors import BhdError, ConfigError, brief, counted
-from bhd_lerobot.hub.transfer import command_line, quiet_bars, remote_of
+from bhd_lerobot.hub.transfer import quiet_bars, remote_of
 
 if TYPE_CHECKING:
     from bhd_lerobot.datasets.remote.push import PushReport
@@ -51,7 +52,9 @@ def push_dataset(
 
 def push_command(root: Path, target: str, *, private: bool = False, tags: Sequence[str] = ()) -> str:
     """Return the command that uploads a dataset."""
-    return command_line("push", [root, target], private=private, tags=list(tags))
+    options = [*["--private"] * private, *([f"--tags={','.join(tags)}"] if tags else [])]
+    # A folder that begins with a dash must not be taken for an option.
+    return shlex.join(["bhd-data", "push", f"{'./' * str(root).startswith('-')}{root}", target, *options])
 
 
 def left_by_interrupt(root: Path, again: str) -> str:

@@ -8,7 +8,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -23,27 +23,10 @@ if TYPE_CHECKING:
 PATIENCE_S = 3.0
 """How long the threads of a transfer may take to end after Ctrl-C [s]; a stalled connection holds them for minutes."""
 
-_PLACES = {"command", "places", "source", "root", "repo_id"}
 
-
-def command_line(command: str, places: Sequence[object], **options: Any) -> str:
-    """Return a command as the user would type it; options that are None, false or empty are left out."""
-    # A folder that begins with a dash must not be taken for an option.
-    words = ["bhd-data", command, *(f"./{place}" if str(place).startswith("-") else str(place) for place in places)]
-    for name, value in options.items():
-        if value is True:
-            words.append(f"--{name}")
-        elif value is not None and value is not False and value not in ("", []):  # 0 is a value
-            words.append(f"--{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
-    return shlex.join(words)
-
-
-def repeat_line(options: argparse.Namespace, *places: object, **others: object) -> str:
-    """Return the command that repeats this one, with the options that are not defaults."""
-    parser: argparse.ArgumentParser = options.command_parser
-    given = {name: value for name, value in vars(options).items() if value != parser.get_default(name)}
-    rest = {name: value for name, value in given.items() if name not in _PLACES}
-    return command_line(options.command, places, **others, **rest)
+def again_line(options: argparse.Namespace) -> str:
+    """Return the command that was given, to repeat it."""
+    return shlex.join(["bhd-data", *options.given])
 
 
 def refuse_empty(options: argparse.Namespace) -> None:

@@ -125,12 +125,14 @@ class Parser(argparse.ArgumentParser):
     def parse(self, arguments: Sequence[str] | None) -> argparse.Namespace:
         """Return what a command line asks for; end with status 2 if it has what is not known.
 
-        Of a command whose default `entries_of` is the name of an option, what begins with ``--NAME.`` is in `entries`.
+        `given` holds all words. Of a command whose default `entries_of` is the name of an option, what begins with
+        ``--NAME.`` is in `entries`.
         """
         given = sys.argv[1:] if arguments is None else arguments
         entries = [one for one in given if re.match(r"--\w+\.", one)]  # argparse takes one with a space for positional
         options, unknown = self.parse_known_args([one for one in given if one not in entries])
         unknown += entries
+        options.given = list(given)
         if entries_of := getattr(options, "entries_of", ""):
             options.entries = [argument for argument in unknown if argument.startswith(f"--{entries_of}.")]
             unknown = [argument for argument in unknown if argument not in options.entries]

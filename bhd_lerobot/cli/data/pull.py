@@ -12,12 +12,12 @@ from bhd_lerobot.datasets.remote.listing import megabytes
 from bhd_lerobot.datasets.remote.place import check_repo_id, is_url
 from bhd_lerobot.errors import ConfigError, DatasetWriteError, TransferError, counted
 from bhd_lerobot.hub.transfer import (
+    again_line,
     folder_of,
     prompt_interrupt,
     quiet_bars,
     refuse_empty,
     remote_of,
-    repeat_line,
     split_list,
     warn_of_folder,
 )
@@ -46,7 +46,7 @@ def _run(options: argparse.Namespace) -> int:
     from bhd_lerobot.datasets.remote.pull import pull
 
     source, root = _places(options)
-    again = repeat_line(options, source, root=root)
+    again = again_line(options)
     kept = f"{root} is unchanged{'' if is_url(source) else ', and downloaded files are not fetched again'}."
     options.stopped = f"{kept} Continue with:\n  {again}"
     select = _selection(options)

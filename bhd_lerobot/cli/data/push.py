@@ -9,10 +9,10 @@ from bhd_lerobot.datasets.remote.place import check_repo_id, is_url
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.hub.push import format_push_report, left_by_interrupt, push_dataset
 from bhd_lerobot.hub.transfer import (
+    again_line,
     folder_of,
     prompt_interrupt,
     refuse_empty,
-    repeat_line,
     split_list,
     warn_of_folder,
 )
@@ -45,7 +45,7 @@ def add_to(commands: Commands) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     root, target = _places(options)
-    again = repeat_line(options, root, target)
+    again = again_line(options)
     options.stopped = left_by_interrupt(root, again)
     with prompt_interrupt(options.stopped):
         report = push_dataset(
