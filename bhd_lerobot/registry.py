@@ -26,7 +26,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.registry import Registry, with_article
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
-from bhd_lerobot.policies.brain import Brain, BrainConfig, ConfiguredBrain
+from bhd_lerobot.policies.brain import Brain, BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerBrain, DaggerConfig, check_drivers
 from bhd_lerobot.policies.language.language_brain import LanguageBrain
 from bhd_lerobot.policies.learned.brain import LearnedBrain
@@ -130,9 +130,9 @@ def register_task[T](name: str, config: type[TaskConfig]) -> Callable[[type[T]],
     """Return a decorator that registers a task's class under a name, with its configuration.
 
     Raises:
-        ConfigError: another task has this name, or `needs` names what is no part.
+        ConfigError: another task has this name, `needs` names what is no part, or the class is not derived from `Task`.
     """
-    return _decorator(TASKS, name, config)
+    return _decorator(TASKS, name, config, Task)
 
 
 def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]], type[T]]:
@@ -140,22 +140,19 @@ def register_brain[T](name: str, config: type[BrainConfig]) -> Callable[[type[T]
 
     Raises:
         ConfigError: another brain has this name, `needs` names what is no part, or the class is not derived from
-            `ConfiguredBrain`.
+            `Brain`.
     """
+    return _decorator(BRAINS, name, config, Brain)
 
+
+def _decorator[T](registry: Registry[Any], name: str, config: type, base: type) -> Callable[[type[T]], type[T]]:
     def register(made: type[T]) -> type[T]:
-        if not issubclass(made, ConfiguredBrain):
+        if not issubclass(made, base):
+            word = base.__name__.lower()
             raise ConfigError(
-                f"The class of the brain {name!r}, {made.__name__}, is not derived from bhd_lerobot.ConfiguredBrain, "
-                f"which defines what a brain may leave out: write class {made.__name__}(bhd.ConfiguredBrain)."
+                f"The class of the {word} {name!r}, {made.__name__}, is not derived from bhd_lerobot.{base.__name__}, "
+                f"which defines what a {word} may leave out: write class {made.__name__}(bhd.{base.__name__})."
             )
-        return _decorator(BRAINS, name, config)(made)
-
-    return register
-
-
-def _decorator[T](registry: Registry[Any], name: str, config: type) -> Callable[[type[T]], type[T]]:
-    def register(made: type[T]) -> type[T]:
         kind, needs = getattr(made, "robot_kind", None), getattr(made, "needs", None)
         if kind is not None or not isinstance(needs, tuple) or not set(needs) <= set(PARTS):
             given = f"needs = {needs!r}" if kind is None else f"robot_kind = {kind!r}"

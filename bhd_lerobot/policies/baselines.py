@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Range
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
+from bhd_lerobot.policies.brain import Brain, BrainConfig, Observation, RobotFeatures, find_columns
 
 _SPEED, _POSITION = ".vel", ".pos"
 
@@ -36,7 +36,7 @@ class RandomConfig(BrainConfig):
     scale: Annotated[float, Range("(0, 1]")] = 1.0
 
 
-class NoopBrain(ConfiguredBrain):
+class NoopBrain(Brain):
     """Holds: speeds are 0, and positions are those that the episode began with."""
 
     name = "noop"

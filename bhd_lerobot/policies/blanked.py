@@ -16,7 +16,6 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import (
     Brain,
     BrainConfig,
-    ConfiguredBrain,
     DriverConfig,
     Observation,
     RobotFeatures,
@@ -54,7 +53,7 @@ class BlankedConfig(BrainConfig):
             )
 
 
-class BlankedBrain(ConfiguredBrain):
+class BlankedBrain(Brain):
     """Passes everything on to a brain but its instruction or its images."""
 
     name = "blanked"

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import draccus
 import numpy as np
@@ -87,30 +87,38 @@ class RobotFeatures:
         return self.body.need(part)
 
 
-class Brain(Protocol):
+class Brain:
     """A rule or a network that drives n robots.
 
     A brain learns once which features it will see and which it must command; it finds its inputs by name and fails at
-    once, with the names it misses, if they are not there. `ConfiguredBrain` has all of it but `bind` and `act`.
+    once, with the names it misses, if they are not there. A subclass sets `needs` and defines `bind` and `act`. What
+    else it may offer is as it is here otherwise: no images, no plan and no expert.
+
+    Attributes:
+        config: the parameters.
+        needs: the parts that a robot needs for it, such as ``(Drive, LidarSpec)``; empty if every robot may do.
+        uses_images: whether `act` uses the observation's images. If not, it is not kept waiting for them and may get
+            none.
+        uses_privileged_state: whether `act` uses the observation's `environment_state`, which no sensor measures. If
+            not, it gets none. Of one that does not say, it is taken for granted that it uses what the task reports.
+        has_plan: whether it works step by step, and `subtasks` and `plan` say what it does.
+        attempts: whether it attempts the task; of one that does not, no episode has an outcome that means anything.
     """
 
     name: str
-    needs: tuple[type, ...]
-    """The parts that a robot needs for it, types of `bhd_lerobot.bodies.body`; empty if every robot may do."""
-    has_plan: bool
-    """Whether it works step by step, and `subtasks` and `plan` say what it does."""
+    needs: tuple[type, ...] = ()
+    uses_images = False
+    uses_privileged_state: bool = True
+    has_plan = False
+    attempts = True
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
 
     @classmethod
     def robot_of(cls, config: Any) -> str:
         """Return the type of robot that a brain of this configuration is for; empty if every one with the parts."""
-
-    @property
-    def uses_images(self) -> bool:
-        """Whether `act` uses the observation's images. If not, it is not kept waiting for them and may get none."""
-
-    @property
-    def uses_privileged_state(self) -> bool:
-        """Whether `act` uses the observation's `environment_state`, which no sensor measures. If not, it gets none."""
+        return ""
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot it will drive.
@@ -118,6 +126,7 @@ class Brain(Protocol):
         Raises:
             ConfigError: a feature or a camera that the brain needs is missing, or not as it needs it.
         """
+        raise NotImplementedError
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start episodes in some of n simulations: forget what was seen there.
@@ -131,15 +140,18 @@ class Brain(Protocol):
 
     def subtasks(self) -> Sequence[str]:
         """Return what the brain is doing in each simulation, as text; of a brain that `has_plan`."""
+        return ()
 
     def plan(self, sim: int) -> dict[str, Any]:
         """Return the plan of one simulation, as plain values; of a brain that `has_plan`."""
+        return {}
 
     def act(self, observation: Observation) -> Command:
         """Return the command of n robots for this frame.
 
         A brain returns goals always or never; among them may be setpoints, for robots that follow none.
         """
+        raise NotImplementedError
 
     def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations the next `act` uses images; in the others it may get black ones.
@@ -150,85 +162,35 @@ class Brain(Protocol):
         Returns:
             Shape (n,), or () for all of them.
         """
+        return np.array(self.uses_images)
 
     def advice(self) -> NDArray[np.float64] | None:
         """Return what an expert would do in the frame that `act` decided last, shape (n, actions); None without one."""
+        return None
 
     def interventions(self) -> NDArray[np.bool_] | None:
         """Return which robots an expert drives in the frame that `act` decided last, shape (n,); None without one."""
+        return None
 
     def causes(self) -> Sequence[str]:
         """Return why the expert took over last, as text, of each simulation; empty without a takeover in this episode.
 
         Called only where `interventions` is true of a robot.
         """
+        return ()
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the brain, as plain values."""
+        return {"type": self.name, **asdict(self.config)}
+
+
+ConfiguredBrain = Brain
+"""The name by which plug-ins of version 0.3 know it."""
 
 
 def is_privileged(brain: Brain, environment_names: Sequence[str]) -> bool:
     """Return whether a brain acts on what no sensor tells: it uses the environment state, and the task reports one."""
     return bool(environment_names) and brain.uses_privileged_state
-
-
-class ConfiguredBrain:
-    """Base class of brains: one that uses no images, has no plan and no expert, and depends on the observation alone.
-
-    A subclass sets `needs` and defines `bind` and `act`.
-
-    Attributes:
-        config: the parameters.
-        needs: the parts that a robot needs for it, such as ``(Drive, LidarSpec)``; empty if every robot may do.
-    """
-
-    name: str
-    needs: tuple[type, ...] = ()
-    uses_images = False
-    uses_privileged_state: bool = True
-    """Of a brain that does not say, it is taken for granted that it uses what the task reports, if that is anything."""
-    has_plan = False
-    attempts = True
-    """Whether it attempts the task: of one that does not, no episode has an outcome that means anything."""
-
-    def __init__(self, config: Any) -> None:
-        self.config = config
-
-    @classmethod
-    def robot_of(cls, config: Any) -> str:
-        """Return no type: every robot with the parts."""
-        return ""
-
-    def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
-        """Forget nothing: what it does depends on the observation alone."""
-
-    def subtasks(self) -> Sequence[str]:
-        """Return nothing: there is no plan."""
-        return ()
-
-    def plan(self, sim: int) -> dict[str, Any]:
-        """Return nothing: there is no plan."""
-        return {}
-
-    def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
-        """Return whether it uses images, in every frame and simulation."""
-        return np.array(self.uses_images)
-
-    def advice(self) -> NDArray[np.float64] | None:
-        """Return nothing: there is no expert."""
-        return None
-
-    def interventions(self) -> NDArray[np.bool_] | None:
-        """Return nothing: nobody takes over."""
-        return None
-
-    def causes(self) -> Sequence[str]:
-        """Return nothing: nobody takes over."""
-        return ()
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the type and the parameters."""
-        return {"type": self.name, **asdict(self.config)}
 
 
 def find_columns(names: Sequence[str], wanted: Sequence[str], who: str, what: str) -> NDArray[np.intp]:

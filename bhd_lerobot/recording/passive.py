@@ -17,7 +17,7 @@ from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError, as_text
 from bhd_lerobot.options.declared import Options, Positive
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.recording.onlooker import Onlooker
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.realtime import LiveHost
@@ -63,7 +63,7 @@ class _Commanded(FreeTask):
         return {"type": self.name}
 
 
-class _Others(ConfiguredBrain):
+class _Others(Brain):
     """Those who command the robot."""
 
     name = "bridge"

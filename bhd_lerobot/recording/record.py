@@ -103,7 +103,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
                 loop.observer = opened.enter_context(live_view(config, robots, console))
                 made = open_recorder(_recording(config, root), robots, task, brain)
                 recorder = opened.enter_context(closing_used(made, is_new=is_new))
-            result = RecordResult(root, output_dir, attempts=getattr(brain, "attempts", True), stopped_by=stop)
+            result = RecordResult(root, output_dir, attempts=brain.attempts, stopped_by=stop)
             if recorder.repair_report:
                 console.print(f"Repaired before resuming: {recorder.repair_report}")
             album, first = _run(config, recorder, loop, result, console)

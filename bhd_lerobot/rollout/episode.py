@@ -24,7 +24,7 @@ from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.tolerance import FrameTiming, TimingTolerance, late_frames
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.faults import add_faults
-from bhd_lerobot.tasks.task import ConfiguredTask, Event, Task, outcomes_of
+from bhd_lerobot.tasks.task import Event, Task, outcomes_of
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
@@ -277,8 +277,8 @@ class EpisodeLoop:
         robots = self.robots
         running = np.flatnonzero(robots.running)
         if robots.clock is not None:
-            if isinstance(self.task, ConfiguredTask):  # time goes on in frames that were left out
-                self.task.frame[running] += max(0, report.number - self._last_frame - 1)
+            # Time goes on in frames that were left out.
+            self.task.frame[running] += max(0, report.number - self._last_frame - 1)
             if self.status is not None:
                 self.status.frame(report.number)
         self._last_frame, self._mode = report.number, report.mode

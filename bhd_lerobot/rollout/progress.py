@@ -26,8 +26,7 @@ def progress_bars(console: Console, *fields: str) -> Progress:
 
 def part_done(loop: Any) -> float:
     """Return how much of the running episodes is done, in episodes; each is taken to last as long as it may."""
-    frame, most = getattr(loop.task, "frame", None), getattr(loop.task, "max_frames", 0)
-    return float(frame[loop.robots.running].sum() / most) if frame is not None and most else 0.0
+    return float(loop.task.frame[loop.robots.running].sum() / loop.task.max_frames)
 
 
 def print_notes(console: Console, robots: Robots, task: Any = None) -> None:

@@ -15,7 +15,7 @@ from bhd_lerobot.bodies.tabletop import COLOURS, OBJECT_FIELDS
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Positive, Range
 from bhd_lerobot.tasks.navigate import goal_in_robot
-from bhd_lerobot.tasks.task import ConfiguredTask, Event, Outcome, TaskConfig
+from bhd_lerobot.tasks.task import Event, Outcome, Task, TaskConfig
 
 ENVIRONMENT = (
     *(f"object_0_{name}" for name in OBJECT_FIELDS),
@@ -45,7 +45,7 @@ class FetchConfig(TaskConfig):
     max_obstacles: Annotated[int, Range(f"[0, {2 * MOST_OBSTACLES}]")] = MOST_OBSTACLES
 
 
-class FetchTask(ConfiguredTask):
+class FetchTask(Task):
     """The fetch task for n simulations.
 
     Success: the object stands within `tolerance_m` of its place, at rest and let go of, for `hold_s`. Failures:

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.tasks.task import ConfiguredTask, Event, Outcome, Task
+from bhd_lerobot.tasks.task import Event, Outcome, Task
 
 
-class OperatorTask(ConfiguredTask):
+class OperatorTask(Task):
     """A task in front of a real robot that does not measure what the task is judged by.
 
     An episode ends when a person states how (`bhd_lerobot.rollout.marks`), or when its time is over. The brain is told

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import draccus
 import numpy as np
@@ -116,67 +116,26 @@ class Outcome:
     details: dict[str, float] = field(default_factory=dict)
 
 
-class Task(Protocol):
+class Task:
     """A task for n simulations at once; each of them is in an episode of its own.
+
+    A subclass defines `sample`, `instruction`, `judge` and `outcome`, and whatever else is not as it is here.
 
     Attributes:
         name: its name.
         needs: the parts that a robot needs for it, types of `bhd_lerobot.bodies.body`; empty if every robot can do it.
-        duration_s: longest duration of an episode [s].
+        excludes: the parts that a robot must not have for it.
         environment_names: names of what the task reports to the brain, in order; empty if nothing.
         lasts: whether success is to have lasted until the time is over; an episode is then truncated, not terminated.
         judged_by: the fields of the truth without which it cannot be judged; None if it takes a simulator's.
-    """
-
-    name: str
-    needs: tuple[type, ...]
-    duration_s: float
-    environment_names: tuple[str, ...]
-    lasts: bool
-    judged_by: frozenset[str] | None
-
-    def sample(self, seed: int) -> Any:
-        """Return the scene of the episode with this seed: an `Arena` or a `TableScene`."""
-
-    def instruction(self, scene: Any) -> str:
-        """Return what a person would ask for in this scene."""
-
-    def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
-        """Start episodes in some simulations."""
-
-    def environment_state(self, truth: Any) -> NDArray[np.float64]:
-        """Return what the task reports to the brain now, shape (n, len(environment_names))."""
-
-    def privileged_state(self) -> NDArray[np.float64]:
-        """Return what decides an outcome and no brain is told, numbers around 1, shape (n, any); for a critic.
-
-        How much time is left is not among it: an episode whose time is over is truncated, and its value continues.
-        """
-
-    def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the reward and the `Event` of the frame that just ended, each of shape (n,).
-
-        An event other than `NOTHING` ends the episode. Simulations that are not running get 0.
-        """
-
-    def outcome(self, sim: int, event: Event) -> Outcome:
-        """Return how the episode of one simulation ended, given the event that ended it."""
-
-    def parameters(self) -> dict[str, Any]:
-        """Return everything that defines the task, as plain values."""
-
-
-class ConfiguredTask:
-    """What the tasks have in common: parameters, rate, and the number of frames so far.
-
-    Attributes:
+        notes: what a person has to know before the episodes begin.
+        never: events that cannot happen in this task.
         config: the parameters.
         body: the robot's hardware; None if it is not known.
         fps: frames a second [Hz].
         duration_s: longest duration of an episode [s].
         max_frames: the same [frames].
         frame: frames of each episode so far, shape (n,); `begin` sets them to 0, `count_frame` counts.
-        notes: what a person has to know before the episodes begin.
 
     Args:
         config: the parameters, with a `duration_s`.
@@ -186,15 +145,13 @@ class ConfiguredTask:
     """
 
     name: str
-    environment_names: tuple[str, ...] = ()
-    lasts = False
     needs: tuple[type, ...] = ()
     excludes: tuple[type, ...] = ()
-    """The parts that a robot must not have for it."""
+    environment_names: tuple[str, ...] = ()
+    lasts = False
     judged_by: frozenset[str] | None = None
     notes: tuple[str, ...] = ()
     never: ClassVar[tuple[Event, ...]] = ()
-    """Events that cannot happen in this task."""
 
     def __init__(self, config: Any, n: int, fps: int, body: Body | None = None) -> None:
         self.config, self.body = config, body
@@ -207,6 +164,14 @@ class ConfiguredTask:
     def in_frames(self, seconds: float) -> int:
         """Return a time in frames, at least 1."""
         return max(1, round(seconds * self.fps))
+
+    def sample(self, seed: int) -> Any:
+        """Return the scene of the episode with this seed: an `Arena` or a `TableScene`."""
+        raise NotImplementedError
+
+    def instruction(self, scene: Any) -> str:
+        """Return what a person would ask for in this scene."""
+        raise NotImplementedError
 
     def begin(self, ids: NDArray[np.intp], scenes: Sequence[Any]) -> None:
         """Start episodes in some simulations."""
@@ -222,19 +187,33 @@ class ConfiguredTask:
         return np.where(running & (self.frame >= self.max_frames), int(Event.TIMEOUT), int(Event.NOTHING))
 
     def environment_state(self, truth: Any) -> NDArray[np.float64]:
-        """Report nothing to the brain, shape (n, 0)."""
+        """Return what the task reports to the brain now, shape (n, len(environment_names))."""
         return np.zeros((len(self._sims), 0))
 
     def privileged_state(self) -> NDArray[np.float64]:
-        """Return nothing, shape (n, 0)."""
+        """Return what decides an outcome and no brain is told, numbers around 1, shape (n, any); for a critic.
+
+        How much time is left is not among it: an episode whose time is over is truncated, and its value continues.
+        """
         return np.zeros((len(self._sims), 0))
 
+    def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the reward and the `Event` of the frame that just ended, each of shape (n,).
+
+        An event other than `NOTHING` ends the episode. Simulations that are not running get 0.
+        """
+        raise NotImplementedError
+
+    def outcome(self, sim: int, event: Event) -> Outcome:
+        """Return how the episode of one simulation ended, given the event that ended it."""
+        raise NotImplementedError
+
     def parameters(self) -> dict[str, Any]:
-        """Return everything that defines the task."""
+        """Return everything that defines the task, as plain values."""
         return {"type": self.name, **asdict(self.config)}
 
 
-class BaseTask(ConfiguredTask):
+class BaseTask(Task):
     """What the tasks of bases have in common: arenas with room for the robot."""
 
     needs: tuple[type, ...] = (Drive,)
@@ -245,7 +224,7 @@ class BaseTask(ConfiguredTask):
         return make_arena(name, seed, random_start, robot_radius=radius)
 
 
-class ArmTask(ConfiguredTask):
+class ArmTask(Task):
     """What the tasks of arms have in common; their scenes are `TableScene`."""
 
     needs: tuple[type, ...] = (Arm,)

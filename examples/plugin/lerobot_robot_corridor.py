@@ -92,7 +92,7 @@ class WallFollowerConfig(bhd.BrainConfig):
 
 
 @bhd.register_brain("wall_follower", WallFollowerConfig)
-class WallFollower(bhd.ConfiguredBrain):
+class WallFollower(bhd.Brain):
     """Steers by the distance to the wall on the right and by the angle to it, a line through the beams there."""
 
     needs = (bhd.Drive, bhd.LidarSpec)

@@ -10,7 +10,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.envs.episodes import SteppedEpisodes
 from bhd_lerobot.envs.gym_env import BhdEnv
 from bhd_lerobot.envs.settings import make_settings
-from bhd_lerobot.policies.brain import ConfiguredBrain
+from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.registry import make_simulation, make_task
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import EpisodeSpec
@@ -21,7 +21,7 @@ from tests.envs.support import NAMES, short, some_actions
 ONE = np.zeros(1, np.intp)
 
 
-class Script(ConfiguredBrain):
+class Script(Brain):
     """Plays rows of actions, the same in every simulation, from each episode's start."""
 
     name = "script"

@@ -30,7 +30,7 @@ class Config(bhd.BrainConfig):
     pass
 
 @bhd.register_brain("{name}", Config)
-class Mine(bhd.ConfiguredBrain):
+class Mine(bhd.Brain):
     needs = (bhd.Drive,)
 """
 
@@ -97,22 +97,26 @@ def test_a_name_that_is_taken_is_refused_and_the_first_stays(installer) -> None:
     assert BrainConfig.get_choice_class("twice").__module__ == "lerobot_robot_first"
 
 
-def test_a_brain_that_is_not_derived_from_the_base_class_is_refused(installer) -> None:
-    installer.install("lerobot_robot_plain", BRAIN.format(name="plain").replace("Mine(bhd.ConfiguredBrain)", "Mine"))
+def test_what_is_not_derived_from_the_base_class_is_refused(installer) -> None:
+    installer.install("lerobot_robot_plain", BRAIN.format(name="plain").replace("Mine(bhd.Brain)", "Mine"))
     reported: list[str] = []
     plugins.load_plugins(reported.append)
     [text] = reported
-    assert "brain 'plain', Mine, is not derived from bhd_lerobot.ConfiguredBrain" in text
-    assert "write class Mine(bhd.ConfiguredBrain)" in text
+    assert "brain 'plain', Mine, is not derived from bhd_lerobot.Brain" in text
+    assert "write class Mine(bhd.Brain)" in text
     assert "plain" not in registry.brains_for("turtlebot3")
+    with pytest.raises(ConfigError, match=r"task 'mine', Mine, is not derived.* write class Mine\(bhd\.Task\)"):
+        registry.register_task("mine", bhd.TaskConfig)(type("Mine", (), {}))
 
 
 @each_case(
     ("attribute", "value"), [("robot_kind", "base"), ("needs", bhd.Drive), ("needs", ("base",)), ("needs", None)]
 )
-@each_case("register", [registry.register_brain, registry.register_task])
-def test_needs_are_parts_of_a_robot_and_an_old_robot_kind_is_named(register: Any, attribute: str, value: Any) -> None:
-    made = type("Mine", (bhd.ConfiguredBrain,), {attribute: value})
+@each_case(("register", "base"), [(registry.register_brain, bhd.Brain), (registry.register_task, bhd.Task)])
+def test_needs_are_parts_of_a_robot_and_an_old_robot_kind_is_named(
+    register: Any, base: type, attribute: str, value: Any
+) -> None:
+    made = type("Mine", (base,), {attribute: value})
     given = re.escape(f"{attribute} = {value!r}")
     with pytest.raises(ConfigError, match=rf"class of 'mine', Mine, has {given}\. .*needs = \(bhd\.Drive"):
         register("mine", bhd.BrainConfig)(made)

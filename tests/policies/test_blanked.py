@@ -7,11 +7,11 @@ import pytest
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation
+from bhd_lerobot.policies.brain import Brain, Observation
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 
 
-class Spy(ConfiguredBrain):
+class Spy(Brain):
     """Notes what it gets."""
 
     has_plan, uses_images, uses_privileged_state = True, True, False
@@ -80,7 +80,7 @@ def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> N
 
 
 def test_what_cannot_be_blanked_is_refused_and_who_does_not_say_it_is_taken_to_be_told_the_truth() -> None:
-    inner: Any = ConfiguredBrain(None)
+    inner: Any = Brain(None)
     assert BlankedBrain(BlankedConfig(brain=None, images=True), inner).uses_privileged_state  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"brain\.brain\.instruction is 'pick up the red cup'"):
         BlankedConfig(LanguageBrainConfig(instruction="pick up the red cup"), instruction=True)

@@ -12,7 +12,7 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
-from bhd_lerobot.policies.brain import ConfiguredBrain
+from bhd_lerobot.policies.brain import Brain
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.policies.manipulation.servo import PickServoConfig
 from bhd_lerobot.policies.navigation.gap_follower import GapFollowerConfig
@@ -149,7 +149,7 @@ def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
     assert [intervention.cause for intervention in episode.interventions] == ["no progress"]
 
 
-class Stub(ConfiguredBrain):
+class Stub(Brain):
     """Says who drives."""
 
     def __init__(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
-from bhd_lerobot.policies.brain import ConfiguredBrain, is_privileged
+from bhd_lerobot.policies.brain import Brain, is_privileged
 from bhd_lerobot.registry import make_robot, make_simulation, make_task
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
@@ -24,7 +24,7 @@ from tests.robots.host.support import relaxed, unique
 FRAMES = 20
 
 
-class Script(ConfiguredBrain):
+class Script(Brain):
     """Plays the rows of a script: one by one, or `length` of them at a time, every `every` frames."""
 
     name = "script"

@@ -17,7 +17,6 @@ from bhd_lerobot.options.declared import Positive
 from bhd_lerobot.policies.brain import (
     Brain,
     BrainConfig,
-    ConfiguredBrain,
     DriverConfig,
     Observation,
     RobotFeatures,
@@ -69,7 +68,7 @@ class DaggerConfig(BrainConfig):
             )
 
 
-class DaggerBrain(ConfiguredBrain):
+class DaggerBrain(Brain):
     """Drives with a learner, and with an expert where the learner needs help.
 
     The learner acts in every frame of its turns, and between them if it gets another; the expert acts in every frame,

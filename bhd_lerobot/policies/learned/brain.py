@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.commands import Chunk, CommandResult
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.options.declared import Count
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, BrainConfig, Observation, RobotFeatures
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 
@@ -57,7 +57,7 @@ class LearnedBrainConfig(BrainConfig):
             raise ConfigError("brain.path is empty; name a checkpoint or a training run's folder.")
 
 
-class LearnedBrain(ConfiguredBrain):
+class LearnedBrain(Brain):
     """Drives n simulations, whose episodes need not be in step, with one policy.
 
     Every simulation has its own chunk, history and random numbers, which follow from its episode's seed; those that

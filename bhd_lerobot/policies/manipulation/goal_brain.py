@@ -13,7 +13,7 @@ from bhd_lerobot.bodies.tabletop import check_camera_error
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Count, Positive
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, BrainConfig, Observation, RobotFeatures
 
 
 @dataclass
@@ -38,7 +38,7 @@ class GoalBrainConfig(BrainConfig):
         check_camera_error("brain.camera_error_m", self.camera_error_m)
 
 
-class GoalBrain(ConfiguredBrain, ABC):
+class GoalBrain(Brain, ABC):
     """A brain that gives each simulation one goal after the other.
 
     A subclass returns the next goal in `decide`, which is called at the start, whenever a goal has ended, and in each

@@ -19,7 +19,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, check_camera
 from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Positive, Range
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
+from bhd_lerobot.policies.brain import Brain, BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.manipulation.grasp import Grasp, SeenObject, plan_grasp, pointing_down, read_objects
 from bhd_lerobot.policies.manipulation.pick import SQUEEZE
 from bhd_lerobot.policies.manipulation.reach import TARGET
@@ -86,7 +86,7 @@ class PickServoConfig(ServoConfig):
     wider_m: NotNegative = 0.0
 
 
-class _ServoBrain(ConfiguredBrain):
+class _ServoBrain(Brain):
     """Finds its inputs, and makes a tool pose of where the tool is to go."""
 
     needs = (Arm, GripperSpec)

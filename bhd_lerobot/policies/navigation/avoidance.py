@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.options.declared import Finite, Range
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns, find_scan
+from bhd_lerobot.policies.brain import Brain, BrainConfig, Observation, RobotFeatures, find_columns, find_scan
 from bhd_lerobot.policies.navigation.driving import resting
 
 _ROUNDING = 1e-6  # [m]
@@ -44,7 +44,7 @@ class AvoidanceConfig(BrainConfig):
     range_max_m: Finite = 3.5
 
 
-class AvoidanceBrain(ConfiguredBrain):
+class AvoidanceBrain(Brain):
     """Front sector ±30°; nothing nearer than 0.5 m: 0.2 m/s ahead; otherwise turn left at 0.5 rad/s; blind: stop."""
 
     name = "avoidance"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Drive, LidarSpec
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import NotNegative, Positive, Range, Share
-from bhd_lerobot.policies.brain import BrainConfig, ConfiguredBrain, Observation, RobotFeatures, find_columns
+from bhd_lerobot.policies.brain import Brain, BrainConfig, Observation, RobotFeatures, find_columns
 from bhd_lerobot.policies.navigation.clearance import LONGEST, Footprint, Paths, make_paths
 from bhd_lerobot.policies.navigation.scan import ScanReader
 from bhd_lerobot.policies.navigation.steering import Steering
@@ -83,7 +83,7 @@ def resting(robot: RobotFeatures, who: str) -> Array:
     return action
 
 
-class DrivingBrain(ConfiguredBrain):
+class DrivingBrain(Brain):
     """Reads a scan and the measured twist, and commands a twist along one of `_paths`, for `_n` robots."""
 
     needs = (Drive, LidarSpec)

@@ -15,7 +15,7 @@ from bhd_lerobot.errors import ActionError, BrainStoppedError, ConfigError, as_t
 from bhd_lerobot.options.dotted import flattened
 from bhd_lerobot.options.parse import types_of
 from bhd_lerobot.options.units import other_units
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.start_pose import StartsFromObservation
 from bhd_lerobot.policies.teleop.calls import Calls
 from bhd_lerobot.policies.teleop.config import TeleopConfig
@@ -24,7 +24,7 @@ from bhd_lerobot.policies.teleop.mapping import ActionMap, Pair
 _OURS = "bhd_lerobot."
 
 
-class TeleopBrain(ConfiguredBrain):
+class TeleopBrain(Brain):
     """Drives one robot with what a person does.
 
     Attributes:

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Brain, ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 
 CAUSE = "person"
 
 
-class TakeoverBrain(ConfiguredBrain):
+class TakeoverBrain(Brain):
     """Drives with a brain, and with a person while they have taken over.
 
     Args:

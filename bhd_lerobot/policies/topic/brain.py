@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
 from bhd_lerobot.errors import BrainStoppedError, ConfigError, RealtimeError, unknown_name
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.topic.config import TopicConfig
 from bhd_lerobot.ros2.live.link import NodeLink
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
@@ -23,7 +23,7 @@ _DISCOVERY_S = 5.0  # that it may take until a node of Fast DDS sends to one tha
 _FLOATS = "std_msgs/msg/Float64MultiArray"
 
 
-class TopicBrain(ConfiguredBrain):
+class TopicBrain(Brain):
     """Drives one robot with what another node sends."""
 
     name = "topic"

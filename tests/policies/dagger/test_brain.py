@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.policies.baselines import NoopConfig
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.dagger.brain import LEARNER_DRIVES, DaggerBrain, DaggerConfig
 from bhd_lerobot.policies.dagger.takeover import (
     ArmCollisionWatch,
@@ -42,7 +42,7 @@ UR = RobotFeatures(ARM, JOINTS, 25, (), ur5())
 NO_ADVICE = np.zeros((1, 2))
 
 
-class Fake(ConfiguredBrain):
+class Fake(Brain):
     """Always wants the same, and remembers what it received."""
 
     def __init__(self, name: str, value: float) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.reach import ReachBrain, ReachBrainConfig
 from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
 from bhd_lerobot.registry import make_task
@@ -27,7 +27,7 @@ from tests.robots.external.mock_devices.devices import JOINTS, MockArm, MockArmC
 SEEN = Observation(("a.pos",), np.zeros((1, 1)))
 
 
-class Counting(ConfiguredBrain):
+class Counting(Brain):
     """Says which action it is, since its last reset; looks in the first alone."""
 
     uses_images = True
