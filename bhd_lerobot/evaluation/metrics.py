@@ -64,7 +64,7 @@ class JerkMeasure:
         return np.linalg.norm(np.diff(values, self.order, axis=0), axis=1) * float(fps) ** self.order
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EpisodeMetrics:
     """One episode of one brain, in numbers.
 
@@ -99,21 +99,21 @@ class EpisodeMetrics:
     seed: int
     success: bool
     outcome: str
-    score: float
+    score: float = math.nan
     reward: float
     frames: int
     length_s: float
-    path_m: float
-    jerk_mean: float
-    jerk_max: float
-    limits: dict[str, int]
-    watchdogs: dict[str, int]
-    estops: int
-    faults: int
-    problem: str
-    details: dict[str, float]
-    initial_state: str
-    digest: str
+    path_m: float = math.nan
+    jerk_mean: float = math.nan
+    jerk_max: float = math.nan
+    limits: dict[str, int] = field(default_factory=dict)
+    watchdogs: dict[str, int] = field(default_factory=dict)
+    estops: int = 0
+    faults: int = 0
+    problem: str = ""
+    details: dict[str, float] = field(default_factory=dict)
+    initial_state: str = ""
+    digest: str = ""
     perception: dict[str, float] = field(default_factory=dict)
     wall: dict[str, float] = field(default_factory=dict)
 
@@ -129,18 +129,6 @@ class EnvironmentMetrics(EpisodeMetrics):
 
     task: str
     max_reward: float
-    score: float = math.nan
-    path_m: float = math.nan
-    jerk_mean: float = math.nan
-    jerk_max: float = math.nan
-    limits: dict[str, int] = field(default_factory=dict)
-    watchdogs: dict[str, int] = field(default_factory=dict)
-    estops: int = 0
-    faults: int = 0
-    problem: str = ""
-    details: dict[str, float] = field(default_factory=dict)
-    initial_state: str = ""
-    digest: str = ""
 
     def plain(self) -> dict[str, Any]:
         """Return what the environment returned as plain values; the seed as text, as in the base class."""
