@@ -376,7 +376,7 @@ def _run(config: EnvironmentEvalConfig, one: _Policy, stop: StopRequest) -> Iter
                 n = min(config.n_envs, config.n_episodes - first)
                 try:
                     # LeRobot's progress bars would mix with ours.
-                    with torch.no_grad(), _precision(loaded), contextlib.redirect_stderr(io.StringIO()):
+                    with torch.no_grad(), loaded.precision(), contextlib.redirect_stderr(io.StringIO()):
                         rolled = roll_out(env=watched, n_episodes=n, start_seed=config.seed + first)
                 except _StoppedError:
                     return
@@ -398,12 +398,6 @@ def _run(config: EnvironmentEvalConfig, one: _Policy, stop: StopRequest) -> Iter
 def _tasks(envs: Envs) -> dict[str, Any]:
     """Return the vector environments by their tasks' names."""
     return {f"{group} {number}": env for group, tasks in envs.items() for number, env in tasks.items()}
-
-
-def _precision(loaded: LoadedPolicy) -> Any:
-    """Return the context of `lerobot-eval`: lower precision where the policy was configured so."""
-    config = loaded.config
-    return torch.autocast(torch.device(config.device).type) if config.use_amp else contextlib.nullcontext()
 
 
 def _metrics(

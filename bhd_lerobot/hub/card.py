@@ -14,6 +14,7 @@ from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
 from bhd_lerobot.datasets.remote.listing import PREVIEW
 from bhd_lerobot.datasets.remote.push import Card, sign
+from bhd_lerobot.errors import counted
 from bhd_lerobot.hub.preview import draw
 
 LEROBOT_TAG = "LeRobot"
@@ -71,7 +72,7 @@ def _introduction(summary: DatasetSummary, options: CardOptions) -> str:
     from huggingface_hub import constants
 
     robot = f" of the robot `{summary.robot_type}`" if summary.robot_type else ""
-    text = f"{_some(len(summary.episodes), 'episode')}{robot}, a LeRobotDataset of format v3.0."
+    text = f"{counted(len(summary.episodes), 'episode')}{robot}, a LeRobotDataset of format v3.0."
     if options.repo_id:
         viewer = f"{constants.ENDPOINT}/spaces/lerobot/visualize_dataset?path={options.repo_id}"
         text += f" [View it in LeRobot's viewer]({viewer})."
@@ -93,7 +94,7 @@ def _overview(summary: DatasetSummary) -> str:
     shown = [_cell(task) for task in summary.tasks[:10]]
     more = f", and {len(summary.tasks) - 10} more" if len(summary.tasks) > 10 else ""
     rows.append(("instructions" if len(summary.tasks) > 1 else "instruction", "; ".join(shown) + more))
-    rows.append(("size", f"{summary.size / 1e6:.1f} MB in {_some(summary.files, 'file')}"))
+    rows.append(("size", f"{summary.size / 1e6:.1f} MB in {counted(summary.files, 'file')}"))
     return _table(("", ""), rows)
 
 
@@ -167,7 +168,3 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _cell(text: str) -> str:
     """Return text that neither ends a cell nor starts a tag."""
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
-
-
-def _some(count: int, name: str) -> str:
-    return f"{count} {name}{'' if count == 1 else 's'}"

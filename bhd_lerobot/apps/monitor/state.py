@@ -1,12 +1,12 @@
 """What `bhd-monitor` shows, as plain values, and how it is read from the block of a running robot."""
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from bhd_lerobot.apps.view.packing import finite
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.motion.goal_codec import decode_feedback
 from bhd_lerobot.control.record import command_age_ns
@@ -96,16 +96,8 @@ class MonitorState:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; what is not finite is None."""
-        plain: dict[str, Any] = _finite(asdict(self))
+        plain: dict[str, Any] = finite(asdict(self))
         return plain
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Sampler:

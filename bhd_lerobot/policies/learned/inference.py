@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -112,7 +112,7 @@ class BatchedInference:
     def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
         """Return chunks, shape (len(ids), predicted actions, actions)."""
         chunks = []
-        with torch.inference_mode(), use_threads(self._threads), _precision(self.loaded):
+        with torch.inference_mode(), use_threads(self._threads), self.loaded.precision():
             for start in range(0, len(ids), self._block):
                 sims = ids[start : start + self._block].tolist()
                 block = {key: _filled(values[start : start + self._block], self._block) for key, values in rows.items()}
@@ -216,7 +216,7 @@ class StockInference:
     def infer(self, ids: NDArray[np.intp], rows: Rows) -> NDArray[np.float32]:
         """Return the next action of every simulation, shape (len(ids), 1, actions)."""
         actions = []
-        with torch.inference_mode(), use_threads(self._threads), _precision(self.loaded):
+        with torch.inference_mode(), use_threads(self._threads), self.loaded.precision():
             for row, sim in enumerate(ids.tolist()):
                 batch: dict[str, Any] = {"task": [self._instructions[sim]]}
                 for key, values in rows.items():
@@ -289,11 +289,6 @@ def use_threads(count: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _precision(loaded: LoadedPolicy) -> Any:
-    """Return the context of LeRobot's evaluation: lower precision where the policy was configured so."""
-    return torch.autocast(loaded.config.device.partition(":")[0]) if loaded.config.use_amp else nullcontext()
 
 
 def expected_frames(frames: Sequence[int]) -> int:

@@ -60,6 +60,11 @@ class LoadedPolicy:
         """LeRobot's name of the type of policy."""
         return str(self.config.type)
 
+    def precision(self) -> Any:
+        """Return the context of LeRobot's evaluation: lower precision where the policy was configured so."""
+        device = torch.device(self.config.device).type
+        return torch.autocast(device) if self.config.use_amp else contextlib.nullcontext()
+
     def width(self, key: str) -> int | None:
         """Return how many numbers a vector input, or the action, has; None if the policy does not say."""
         features = {**(self.config.input_features or {}), **(self.config.output_features or {})}
