@@ -14,8 +14,11 @@ from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, brief
 from bhd_lerobot.options.declared import check_options
 
-TOOL = tuple(f"tool_{name}.pos" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+TOOL = tuple(f"tool_{name}.pos" for name in _POSE)
 """Where the tool is, in `observation.state`."""
+TARGET = tuple(f"target_{name}" for name in _POSE)
+"""Where it is to go, in `observation.environment_state`."""
 
 _OPTIMIZER = "optimizer_"
 _SHOWN = 8  # names in a message

@@ -140,7 +140,7 @@ class ToolTarget:
         """Return why the arm cannot follow to a pose, or nothing; take note of the posture if it can."""
         if self._posture is None:
             return ""
-        result = self._kinematics.solve(pose, self._posture)
+        result = self._kinematics.continued(pose, self._posture)
         if result.code != ResultCode.SUCCEEDED:
             return result.message
         if np.abs(result.postures[0] - self._posture).max() > _LARGEST_TURN:

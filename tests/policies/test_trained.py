@@ -136,6 +136,7 @@ def test_frame_by_frame_it_acts_as_on_the_rows_of_a_dataset(kind: str, options: 
         ("bhd_mlp", {"yaw_harmonics": 2}, "no quaternion"),
         ("bhd_mlp", {"yaw_harmonics": 2, "environment_quaternions": [0]}, "do not fit into the 3"),
         ("bhd_mlp", {"sort_objects": True}, "object_0_present"),
+        ("bhd_mlp", {"relative_target": True}, "has no target_x, target_y"),
         ("bhd_mlp", {"residual": ["a.pos"], "residual_columns": [1]}, "residual_columns"),
         ("bhd_mlp", {"scan": {"transform": "log", "start": 4, "beams": 8}}, "10 columns"),
         ("bhd_cnn", {"range_minimum": 4.0}, "policy.range_minimum is 4.0"),

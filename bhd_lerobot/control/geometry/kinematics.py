@@ -160,6 +160,18 @@ class ArmKinematics(ForwardKinematics):
                 break
         return result
 
+    def continued(self, pose: Array, posture: Array) -> IkResult:
+        """Return the postures that reach the next of a stream of poses, see `solve`; the first goes on from `posture`.
+
+        An arm with fewer than six joints is turned away from nearly every pose that is not made for it. The posture
+        that is turned least may be far away, and is not the one that the stream has led to.
+        """
+        if self._numeric is not None and _check_poses(pose[None], posture) is None:
+            found, off = self._numeric.descend(pose, posture, posture[None])
+            if self._numeric.reaches(off)[0] and self.check(found)[0] == _ADMISSIBLE:
+                return IkResult(ResultCode.SUCCEEDED, found, turned=off[:, 1])
+        return self.solve(pose, posture)
+
     def _chosen(self, pose: Array, posture: Array, found: Array, off: Array) -> IkResult:
         """Return which of the postures that reach a pose may be taken, the least turned and then the nearest first."""
         if not len(found):

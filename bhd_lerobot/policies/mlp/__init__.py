@@ -8,5 +8,6 @@ __all__ = [
     "residual_mlp",
     "scan_mlp",
     "statistics_mlp",
+    "target_mlp",
     "yaw_mlp",
 ]

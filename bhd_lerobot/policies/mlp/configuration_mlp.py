@@ -11,7 +11,7 @@ from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Positive, Range, Whole
 from bhd_lerobot.policies.mlp.objects_mlp import FIELDS, object_columns
-from bhd_lerobot.policies.trained import TOOL, TrainedConfig, names_of
+from bhd_lerobot.policies.trained import TARGET, TOOL, TrainedConfig, names_of
 
 
 @dataclass
@@ -107,6 +107,9 @@ class MlpConfig(TrainedConfig):
             it also sees where what is meant is from there.
         objects: where they are in `observation.environment_state`: first column, how many, how many numbers each, and
             which of these are `present`, `target` and the pose; found by their names.
+        relative_target: it also sees where the target pose of the task `reach` is from the tool, which the robot has
+            to observe.
+        target_columns: of that pose in `observation.environment_state`; found by their names.
         tool_columns: of the tool pose in `observation.state`; found by their names.
         optimizer_lr: learning rate of AdamW.
         optimizer_betas: of AdamW.
@@ -143,6 +146,8 @@ class MlpConfig(TrainedConfig):
     residual_columns: list[int] = field(default_factory=list)
     sort_objects: bool = False
     objects: list[int] = field(default_factory=list)
+    relative_target: bool = False
+    target_columns: list[int] = field(default_factory=list)
     tool_columns: list[int] = field(default_factory=list)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -199,15 +204,17 @@ class MlpConfig(TrainedConfig):
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
         """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it."""
         self.find_columns(features)
-        names = names_of(features, OBS_STATE)
+        names, told = names_of(features, OBS_STATE), names_of(features, OBS_ENV_STATE)
         if self.yaw_harmonics and not self.quaternions:
             self.state_quaternions = quaternion_columns(names)
-            self.environment_quaternions = quaternion_columns(names_of(features, OBS_ENV_STATE))
+            self.environment_quaternions = quaternion_columns(told)
         if self.sort_objects and not self.objects:
-            start, count, size, fields = object_columns(names_of(features, OBS_ENV_STATE))
+            start, count, size, fields = object_columns(told)
             self.objects = [start, count, size, *fields] if count else []
-            if set(TOOL) <= set(names):
-                self.tool_columns = [names.index(name) for name in TOOL]
+        if self.relative_target and not self.target_columns and set(TARGET) <= set(told):
+            self.target_columns = [told.index(name) for name in TARGET]
+        if (self.sort_objects or self.relative_target) and not self.tool_columns and set(TOOL) <= set(names):
+            self.tool_columns = [names.index(name) for name in TOOL]
         if not self.scan.is_used or self.scan.beams:
             return
         columns = [i for i, name in enumerate(names) if name.startswith("scan_") and name.endswith(".pos")]
@@ -244,7 +251,9 @@ class MlpConfig(TrainedConfig):
             size = kept[key].shape[0] if key in kept else 0
             if not all(0 <= column <= size - 4 for column in columns):
                 raise ConfigError(f"Quaternions at the columns {columns} do not fit into the {size} of {key}.")
-        self._check_objects(kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0)
+        told = kept[OBS_ENV_STATE].shape[0] if OBS_ENV_STATE in kept else 0
+        self._check_objects(told)
+        self._check_target(width, told)
         if len(set(self.ignored_columns)) == width and OBS_ENV_STATE not in kept and not self.sight_size:
             raise ConfigError(f"policy.ignore is {self.ignore}, which leaves no input.")
         scan = self.scan
@@ -262,4 +271,16 @@ class MlpConfig(TrainedConfig):
             raise ConfigError(
                 f"policy.sort_objects is true, but {OBS_ENV_STATE} of this dataset describes no objects with "
                 f"{', '.join(f'object_0_{one}' for one in FIELDS)}. Leave it false, or record the task 'pick'."
+            )
+
+    def _check_target(self, width: int, told: int) -> None:
+        """Refuse a target that is told or a tool that is observed nowhere among as many columns."""
+        if not self.relative_target:
+            return
+        poses = ((self.tool_columns, width), (self.target_columns, told))
+        if not all(len(columns) == len(TARGET) and max(columns) < size for columns, size in poses):
+            raise ConfigError(
+                f"policy.relative_target is true, but {OBS_ENV_STATE} of this dataset has no {', '.join(TARGET)}, or "
+                f"{OBS_STATE} no {', '.join(TOOL)}. Leave it false, or record the task 'reach' with "
+                "--robot.tool_pose=true."
             )

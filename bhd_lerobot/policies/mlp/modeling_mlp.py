@@ -16,6 +16,7 @@ from bhd_lerobot.policies.mlp.objects_mlp import OBS_RELATIVE, relative_features
 from bhd_lerobot.policies.mlp.residual_mlp import Residual
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder, other_columns, transformed
 from bhd_lerobot.policies.mlp.statistics_mlp import KeepsStatistics, Statistics
+from bhd_lerobot.policies.mlp.target_mlp import OBS_TARGET, TARGET_SIZE, target_features
 from bhd_lerobot.policies.mlp.yaw_mlp import OBS_YAW, harmonics
 
 ACTIVATION_LAYERS: dict[str, type[nn.Module]] = {
@@ -57,7 +58,7 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
         state_size = int(state.shape[0]) if state else 0
         environment_size = int(environment.shape[0]) if environment else 0
         self._keys = [key for key, width in ((OBS_STATE, state_size), (OBS_ENV_STATE, environment_size)) if width]
-        self._kept_keys = [*self._keys, OBS_SCAN, OBS_YAW, OBS_RELATIVE]  # of which a history is kept
+        self._kept_keys = [*self._keys, OBS_SCAN, OBS_YAW, OBS_RELATIVE, OBS_TARGET]  # of which a history is kept
         scan, steps = config.scan, config.n_obs_steps
         columns = other_columns(state_size, scan.start or 0, scan.beams if scan.is_used else 0, config.ignored_columns)
         # Not part of the checkpoint: the configuration says it.
@@ -68,6 +69,7 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
         yaws = 2 * config.yaw_harmonics * config.quaternions
         self._is_relative = config.sort_objects and bool(config.tool_columns)
         relative = relative_size(config.yaw_harmonics) if self._is_relative else 0
+        relative += TARGET_SIZE if config.relative_target else 0
         self.feature_size = (
             steps * (len(columns) + environment_size + yaws + relative) + self._beams + config.sight_size
         )
@@ -107,7 +109,7 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
 
         Returns:
             shape (batch, feature_size): of each observation, oldest first, the state without beams, the environment
-            state, cosines and sines of yaws, and where what is meant is from the tool; then the beams.
+            state, cosines and sines of yaws, and where what is meant, and the target, is from the tool; then the beams.
         """
         config = self.config
         rows = {key: self._history(batch, key) for key in self._keys}
@@ -124,6 +126,8 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
             parts.append(harmonics(self._history(batch, OBS_YAW), config.yaw_harmonics))
         if self._is_relative:
             parts.append(relative_features(self._history(batch, OBS_RELATIVE), config.yaw_harmonics))
+        if config.relative_target:
+            parts.append(target_features(self._history(batch, OBS_TARGET)))
         numbers = self._clipped(torch.cat(parts, dim=-1)).flatten(1)
         if scan is None:
             return numbers

@@ -17,7 +17,8 @@ FIELDS = ("present", "target", "x", "y", "z", "qw", "qx", "qy", "qz")
 OBS_RELATIVE = "observation.bhd_relative"
 """Key of where what is meant is from the tool: x, y, z in the base frame [m], and its yaw from the tool's [rad]."""
 
-_SCALES = (0.1, 0.02, 0.005)  # [m] within which distances are told apart
+SCALES = (0.1, 0.02, 0.005)
+"""Distances from the tool are told apart within these [m]."""
 
 
 @ProcessorStepRegistry.register(name="bhd_object_order_processor")
@@ -77,7 +78,7 @@ def _relative(tool: Tensor, item: Tensor) -> Tensor:
 
 def relative_size(count: int) -> int:
     """Return how many numbers `relative_features` makes, with `count` harmonics."""
-    return 3 * len(_SCALES) + 2 * count
+    return 3 * len(SCALES) + 2 * count
 
 
 def relative_features(values: Tensor, count: int) -> Tensor:
@@ -90,7 +91,7 @@ def relative_features(values: Tensor, count: int) -> Tensor:
         values: shape (…, 4).
         count: harmonics of the yaw.
     """
-    places = [torch.tanh(values[..., :3] / scale) for scale in _SCALES]
+    places = [torch.tanh(values[..., :3] / scale) for scale in SCALES]
     return torch.cat([*places, harmonics(values[..., 3:], count)], dim=-1)
 
 

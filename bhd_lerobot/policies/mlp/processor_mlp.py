@@ -4,6 +4,7 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from bhd_lerobot.policies.mlp.objects_mlp import ObjectOrderProcessorStep
 from bhd_lerobot.policies.mlp.scan_mlp import ScanProcessorStep
+from bhd_lerobot.policies.mlp.target_mlp import TargetProcessorStep
 from bhd_lerobot.policies.mlp.yaw_mlp import YawProcessorStep
 from bhd_lerobot.policies.trained_steps import Pipelines, Stats, TrainedStep, make_pipelines
 
@@ -20,6 +21,10 @@ def make_bhd_mlp_pre_post_processors(config: MlpConfig, dataset_stats: Stats | N
             raise ConfigError("The objects' columns are not known yet; make the policy before its processors.")
         start, count, size, *fields = config.objects
         own.append(ObjectOrderProcessorStep(start, count, size, tuple(fields), tuple(config.tool_columns)))
+    if config.relative_target:
+        if not config.target_columns:
+            raise ConfigError("The target's columns are not known yet; make the policy before its processors.")
+        own.append(TargetProcessorStep(tuple(config.tool_columns), tuple(config.target_columns)))
     if config.yaw_harmonics:
         if not config.quaternions:
             raise ConfigError("The quaternions' columns are not known yet; make the policy before its processors.")

@@ -180,7 +180,7 @@ class ArmPart(Part):
         matrix, problem = pose_matrices(pose)
         if problem is not None or self.config.control == "impedance":
             return pose, problem  # where the spring pulls to; whether the arm gets there is for the spring to find out
-        result = self.kinematics.solve(matrix, before)
+        result = self.kinematics.continued(matrix, before)
         if result.code != ResultCode.SUCCEEDED:
             return before, result.message
         posture = result.postures[0]

@@ -145,6 +145,26 @@ def test_seven_joints_stay_near_the_posture_that_they_are_solved_from() -> None:
             assert way < np.sqrt(other.fun) * 1.02 + 1e-3
 
 
+@pytest.mark.law
+@pytest.mark.parametrize("joints", [4, 5, 7])
+def test_a_stream_that_is_a_little_off_goes_on_from_where_it_is(joints: int) -> None:
+    kinematics, rng = arm(joints), np.random.default_rng(4)
+    for q in postures(kinematics, 200):
+        if not 0.1 < ((q - kinematics.lower) / (kinematics.upper - kinematics.lower)).min() < 0.9:
+            continue
+        pose = kinematics.tool(q)
+        if np.linalg.svd(kinematics.jacobian(q)[:3], compute_uv=False).min() < 0.05:
+            continue
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(0.02 * rng.normal(size=3)).as_matrix()
+        pose[:3, 3] += 0.002 * rng.normal(size=3)
+        found = kinematics.continued(pose, q)
+        assert found.code == ResultCode.SUCCEEDED
+        assert np.abs(found.postures[0] - q).max() < 0.3
+        distance, turned = off(kinematics, found.postures[0], pose)
+        assert distance < (1e-6 if joints > 5 else 1e-4)
+        assert turned == pytest.approx(found.turned[0], abs=1e-6)
+
+
 @pytest.mark.parametrize("joints", [5, 7])
 def test_a_line_is_followed_from_posture_to_posture(joints: int) -> None:
     kinematics = arm(joints)

@@ -24,7 +24,8 @@ from bhd_lerobot.policies.mlp.objects_mlp import (
     relative_size,
 )
 from bhd_lerobot.policies.mlp.scan_mlp import OBS_SCAN, ScanEncoder
-from bhd_lerobot.policies.trained import residual_columns
+from bhd_lerobot.policies.mlp.target_mlp import OBS_TARGET, TARGET_SIZE, target_features
+from bhd_lerobot.policies.trained import TARGET, TOOL, residual_columns
 from bhd_lerobot.tasks.pick import ENVIRONMENT
 from tests.cases import each_case
 
@@ -352,3 +353,49 @@ def test_where_what_is_meant_is_from_the_tool_does_not_depend_on_where_both_are(
     features = relative_features(seen, 2)
     assert features.shape == (40, relative_size(2))
     assert float(features.abs().max()) <= 1  # however far away
+
+
+def poses(rows: int, seed: int) -> np.ndarray:
+    """Return poses, shape (rows, 7), each quaternion of one of its two signs."""
+    rng = np.random.default_rng(seed)
+    quaternions = Rotation.random(rows, rng=rng).as_quat(scalar_first=True)
+    return np.concatenate([rng.normal(size=(rows, 3)), quaternions * rng.choice((-1.0, 1.0), (rows, 1))], axis=1)
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("steps", [1, 2])
+def test_it_sees_where_the_target_is_from_the_tool(tmp_path: Path, steps: int) -> None:
+    made = MlpConfig(
+        device="cpu",
+        hidden_dims=[16],
+        n_obs_steps=steps,
+        relative_target=True,
+        input_features={
+            OBS_STATE: PolicyFeature(FeatureType.STATE, (9,)),
+            OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (8,)),
+        },
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    made.set_dataset_feature_metadata(
+        {OBS_STATE: {"names": ["a.pos", *TOOL, "b.pos"]}, OBS_ENV_STATE: {"names": ["c", *TARGET]}}
+    )
+    policy = MlpPolicy(made)
+    tool, target = poses(20 * steps, 0), poses(20 * steps, 1)
+    target[0] = tool[0] * (1, 1, 1, -1, -1, -1, -1)
+    state, told = np.pad(tool, ((0, 0), (1, 1))), np.pad(target, ((0, 0), (1, 0)))
+    given = {
+        key: torch.tensor(values, dtype=torch.float32).reshape((20, steps, -1) if steps > 1 else (20, -1))
+        for key, values in ((OBS_STATE, state), (OBS_ENV_STATE, told))
+    }
+    for one in make_pre_post_processors(made, dataset_stats=None):
+        one.save_pretrained(tmp_path)
+    again, _ = make_pre_post_processors(made, pretrained_path=str(tmp_path))
+    batch = again(given)
+    turn = [Rotation.from_quat(one[:, 3:], scalar_first=True) for one in (tool, target)]
+    wanted = np.concatenate([target[:, :3] - tool[:, :3], (turn[1] * turn[0].inv()).as_rotvec()], axis=1)
+    np.testing.assert_allclose(batch[OBS_TARGET].reshape(-1, 6), wanted, atol=2e-3)  # in single precision
+    np.testing.assert_allclose(batch[OBS_TARGET].reshape(-1, 6)[0], 0.0, atol=1e-3)
+    features = policy.features(batch)
+    assert features.shape == (20, policy.feature_size)
+    assert policy.feature_size == steps * (9 + 8 + TARGET_SIZE)
+    assert float(target_features(batch[OBS_TARGET]).abs().max()) <= 1  # however far away
