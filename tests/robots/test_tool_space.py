@@ -1,4 +1,4 @@
-"""Tool poses as actions: the numbers, and a UR5 that follows them or says why not."""
+"""Tool poses as actions: the numbers, and arms that follow them or say why not."""
 
 import itertools
 from dataclasses import replace
@@ -12,11 +12,20 @@ from bhd_lerobot.bodies.ur import JOINTS
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.messages import Limit, Mode, Reason
+from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.policies.brain import ConfiguredBrain, Observation, RobotFeatures
+from bhd_lerobot.policies.manipulation.reach import ReachBrain
+from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.parts.arm import pose_matrices
 from bhd_lerobot.robots.parts.names import TOOL_NAMES
 from bhd_lerobot.robots.ur import UR5
+from bhd_lerobot.rollout.episode import EpisodeLoop
+from bhd_lerobot.rollout.types import EpisodeSpec
+from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
+from bhd_lerobot.tasks.task import episode_seed
+from tests.cases import each_case
 
 DOWN = [0.5, 0.1, 0.3, 0.0, 1.0, 0.0, 0.0]
 
@@ -250,3 +259,47 @@ def test_after_refusals_the_first_pose_has_to_be_near_to_the_tool() -> None:
         reason, _ = answer(0.04 * frame, x=3.0 * (frame == 6))
         assert reason == (Reason.NO_POSTURE if frame == 6 else Reason.ACCEPTED)
     assert ahead > 0.12
+
+
+class Recorded(ConfiguredBrain):
+    """Gives the actions of episodes, each in the simulation of its number, and then the last of them for ever."""
+
+    name = "recorded"
+    uses_privileged_state = False
+
+    def __init__(self, actions: list[np.ndarray]) -> None:
+        super().__init__(None)
+        self._actions, self._frame = actions, 0
+
+    def act(self, observation: Observation) -> np.ndarray:
+        self._frame += 1
+        return np.array([rows[min(self._frame, len(rows)) - 1] for rows in self._actions])
+
+    def bind(self, robot: RobotFeatures) -> None:
+        pass
+
+
+@pytest.mark.law
+@each_case("off", [0.0, 0.002])
+@each_case("config", [UR5Config, SO101Config])
+def test_what_the_rule_was_recorded_to_do_reaches_the_target_as_setpoints_too(config: type, off: float) -> None:
+    """Also if it is a little off, as a policy's is: by 2 mm and half a degree, less than counts as reached.
+
+    An arm with five joints cannot be turned as that asks for, and is not to change its posture for it.
+    """
+    arm = Simulation(config(action_space="tool", tool_pose=True), 6, threads=1)
+    task = ReachTask(ReachConfig(duration_s=6.0), arm.n, arm.config.fps, arm.body)
+    specs = [EpisodeSpec(number, episode_seed(0, number, "train")) for number in range(arm.n)]
+    shown = list(EpisodeLoop(arm, task, ReachBrain()).run(specs))
+    assert all(episode.outcome.success for episode in shown)
+    rng, actions = np.random.default_rng(0), []
+    for episode in shown:
+        rows = episode.columns[keys.ACTION].astype(np.float64)
+        way, turn = (one / np.linalg.norm(one) for one in rng.normal(size=(2, 3)))
+        rows[:, :3] += off * way
+        rotation = Rotation.from_rotvec(off * 5 * turn) * Rotation.from_quat(rows[:, 3:7], scalar_first=True)
+        rows[:, 3:7] = rotation.as_quat(scalar_first=True)
+        actions.append(rows)
+    for episode in EpisodeLoop(arm, task, Recorded(actions)).run(specs):
+        assert episode.outcome.success, episode.outcome
+        assert not (episode.columns[keys.LIMITS] & int(Limit.POSTURE)).any()

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from bhd_lerobot.control.geometry.poses import quaternion_columns
 from bhd_lerobot.errors import ConfigError
@@ -102,6 +102,8 @@ class MlpConfig(TrainedConfig):
             the same name: where a robot is to go next is near where it is. Not for what is opened and closed at once,
             such as a gripper: a small error in each frame would add up.
         residual_columns: of each action the column of `observation.state`, -1 for none; found by their names.
+        residual_quaternions: columns of the action at which quaternions begin that are predicted so: of the two signs
+            of each, it learns the one nearer to what is observed; found by their names.
         sort_objects: sort the objects that a task reports (`object_0_present`, …): what is meant first, then the
             nearest to it. Their order in the observation is then of no account. Where the robot observes its tool pose,
             it also sees where what is meant is from there.
@@ -144,6 +146,7 @@ class MlpConfig(TrainedConfig):
     environment_quaternions: list[int] = field(default_factory=list)
     residual: list[str] = field(default_factory=list)
     residual_columns: list[int] = field(default_factory=list)
+    residual_quaternions: list[int] = field(default_factory=list)
     sort_objects: bool = False
     objects: list[int] = field(default_factory=list)
     relative_target: bool = False
@@ -203,7 +206,11 @@ class MlpConfig(TrainedConfig):
 
     def set_dataset_feature_metadata(self, features: Mapping[str, Mapping[str, Any]]) -> None:
         """Find beams, quaternions and what is to be ignored by their names; LeRobot's `make_policy` calls it."""
+        is_known = bool(self.residual_columns)
         self.find_columns(features)
+        if self.residual and not is_known:
+            firsts = quaternion_columns(names_of(features, ACTION))
+            self.residual_quaternions = [one for one in firsts if min(self.residual_columns[one : one + 4]) >= 0]
         names, told = names_of(features, OBS_STATE), names_of(features, OBS_ENV_STATE)
         if self.yaw_harmonics and not self.quaternions:
             self.state_quaternions = quaternion_columns(names)

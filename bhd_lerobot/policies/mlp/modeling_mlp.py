@@ -77,7 +77,9 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
         self.net = nn.Sequential(*_perceptron(config, self.feature_size, outputs))
         self.residual: Residual | None = None
         if config.residual:
-            self.residual = Residual(config.residual_columns, kwargs.get("dataset_stats"), config.min_std)
+            self.residual = Residual(
+                config.residual_columns, kwargs.get("dataset_stats"), config.min_std, config.residual_quaternions
+            )
         self.log_std: nn.Parameter | None = None
         if config.gaussian:
             shape = (config.chunk_size, self._action_size)
@@ -167,7 +169,10 @@ class MlpPolicy(KeepsStatistics, PreTrainedPolicy):
         """Return what `forward` returns, given what the network sees."""
         chunks, logits = self._chunks(features, batch)
         target = batch[ACTION]
-        target = (target.unsqueeze(1) if target.ndim == 2 else target).unsqueeze(1)
+        target = target.unsqueeze(1) if target.ndim == 2 else target
+        if self.residual is not None:
+            target = self.residual.nearer(target, self._history(batch, OBS_STATE)[:, -1])
+        target = target.unsqueeze(1)
         loss = self._loss(chunks, target)
         padding = batch.get(_PADDING)
         valid = torch.ones_like(target[..., :1]) if padding is None else (~padding)[:, None, :, None].to(loss.dtype)
