@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import sys
 from importlib import resources
@@ -30,7 +31,7 @@ def run(folder: Path) -> int:
     assert [name for name, _ in commands] == list(SHORTER)
     for name, line in commands:
         shorter = {option.partition("=")[0] for option in SHORTER[name]}
-        kept = [option for option in line.split() if option.partition("=")[0] not in shorter]
+        kept = [option for option in shlex.split(line) if option.partition("=")[0] not in shorter]
         assert MAINS[name]([*kept, *SHORTER[name]]) == 0, name
     [plugin] = re.findall(r"^PYTHONPATH=. bhd-record (.*) …$", text, re.MULTILINE)
     task = ["--task.type=reach", "--brain.type=reach", "--dataset.repo_id=me/mine", "--dataset.root=data/mine"]

@@ -146,22 +146,21 @@ def test_seven_joints_stay_near_the_posture_that_they_are_solved_from() -> None:
 
 
 @pytest.mark.law
-@pytest.mark.parametrize("joints", [4, 5, 7])
+@pytest.mark.parametrize("joints", [4, 5])
 def test_a_stream_that_is_a_little_off_goes_on_from_where_it_is(joints: int) -> None:
     kinematics, rng = arm(joints), np.random.default_rng(4)
     for q in postures(kinematics, 200):
-        if not 0.1 < ((q - kinematics.lower) / (kinematics.upper - kinematics.lower)).min() < 0.9:
+        place = (q - kinematics.lower) / (kinematics.upper - kinematics.lower)
+        if np.abs(place - 0.5).max() > 0.45 or np.linalg.svd(kinematics.jacobian(q)[:3], compute_uv=False)[-1] < 0.05:
             continue
         pose = kinematics.tool(q)
-        if np.linalg.svd(kinematics.jacobian(q)[:3], compute_uv=False).min() < 0.05:
-            continue
         pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(0.02 * rng.normal(size=3)).as_matrix()
         pose[:3, 3] += 0.002 * rng.normal(size=3)
         found = kinematics.continued(pose, q)
         assert found.code == ResultCode.SUCCEEDED
         assert np.abs(found.postures[0] - q).max() < 0.3
         distance, turned = off(kinematics, found.postures[0], pose)
-        assert distance < (1e-6 if joints > 5 else 1e-4)
+        assert distance < 1e-4
         assert turned == pytest.approx(found.turned[0], abs=1e-6)
 
 

@@ -399,3 +399,34 @@ def test_it_sees_where_the_target_is_from_the_tool(tmp_path: Path, steps: int) -
     assert features.shape == (20, policy.feature_size)
     assert policy.feature_size == steps * (9 + 8 + TARGET_SIZE)
     assert float(target_features(batch[OBS_TARGET]).abs().max()) <= 1  # however far away
+
+
+@pytest.mark.law
+def test_the_sign_of_a_quaternion_that_is_to_be_reached_is_of_no_account() -> None:
+    features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (8,))}, {ACTION: PolicyFeature(FeatureType.ACTION, (8,))}
+    made = MlpConfig(device="cpu", hidden_dims=[16], chunk_size=2, residual=["tool_*"])
+    made.input_features, made.output_features = features
+    made.set_dataset_feature_metadata({OBS_STATE: {"names": ["a.pos", *TOOL]}, ACTION: {"names": [*TOOL, "b.pos"]}})
+    assert made.residual_quaternions == [3]
+    rng = np.random.default_rng(0)
+    stats = {key: {"mean": rng.normal(size=8), "std": rng.uniform(0.1, 0.4, 8)} for key in (OBS_STATE, ACTION)}
+    policy = MlpPolicy(made, dataset_stats=stats)
+    raw = np.pad(poses(40, 2), ((0, 0), (0, 1)))
+    away = Rotation.from_rotvec(rng.normal(size=(40, 3)) * 0.2) * Rotation.from_quat(raw[:, 3:7], scalar_first=True)
+    raw[:, 3:7] = away.as_quat(scalar_first=True)
+    observed = np.pad(poses(40, 2), ((0, 0), (1, 0)))
+
+    def loss(actions: np.ndarray) -> Tensor:
+        rows, seen = (
+            torch.tensor((values - stats[key]["mean"]) / stats[key]["std"], dtype=torch.float32)
+            for key, values in ((ACTION, actions), (OBS_STATE, observed))
+        )
+        return policy({OBS_STATE: seen, ACTION: rows[:, None].repeat(1, 2, 1)}, reduction="none")[0]
+
+    nearer = raw.copy()
+    nearer[:, 3:7] *= np.sign((raw[:, 3:7] * observed[:, 4:]).sum(axis=1, keepdims=True))
+    negative = raw * (1, 1, 1, -1, -1, -1, -1, 1)
+    assert torch.allclose(loss(raw), loss(nearer), atol=1e-4)
+    assert torch.allclose(loss(raw), loss(negative), atol=1e-4)
+    policy.residual = None
+    assert not torch.allclose(loss(raw), loss(negative), atol=1e-1)
