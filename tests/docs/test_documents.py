@@ -38,6 +38,9 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 CONFIGURATIONS = sorted((ROOT / "configs").rglob("*.yaml"))
+TESTS = {
+    name for path in (ROOT / "tests").rglob("*.py") for name in re.findall(r"def (test_\w+)", path.read_text("utf-8"))
+}
 FOLDERS = ("benchmarks", "bhd_lerobot", "configs", "docs", "scripts", "tests")
 
 
@@ -77,7 +80,7 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_references(document: Path) -> list[str]:
-    """Return every relative link, image and file name in a document that leads nowhere."""
+    """Return every relative link, image, and name of a file or a test in a document that leads nowhere."""
     text = document.read_text(encoding="utf-8")
     prose = without_code(text)
     broken = []
@@ -92,6 +95,7 @@ def broken_references(document: Path) -> list[str]:
     for name in re.findall(r"`([\w./-]+)`", prose):
         if name.startswith(tuple(f"{folder}/" for folder in FOLDERS)) and not (ROOT / name).exists():
             broken.append(name)
+    broken += [name for name in re.findall(r"`(test_\w+)`", prose) if name not in TESTS]
     targets_of_make = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     calls = re.findall(r"`make ([a-z-]+)( --)?", prose) + re.findall(r"^make ([a-z-]+)( --)?", text, re.MULTILINE)
     # Options behind a target are options of make.
@@ -110,6 +114,7 @@ def test_every_link_and_every_file_exists() -> None:
         "[x](README.md#no-such-heading)",
         '<img src="no.png">',
         "`docs/no.md`",
+        "`test_of_nothing`",
         "`make nothing`",
         "`make results --only see`",
     ],
