@@ -158,13 +158,15 @@ class NodeLink:
                 raise RealtimeError(f"The process of the ROS 2 {role} is stopped.")
 
     def write(self, values: NDArray[np.float64]) -> None:
-        """Send a command, shape (numbers of all outputs,); never waits."""
+        """Send a command, shape (numbers of all outputs,); never waits. The node is woken by one that is new."""
         record = self._record
+        is_new = (record["values"] != values).any()
         record["stamp_ns"] = time.monotonic_ns()
         record["values"] = values
         self.channel.commands.publish(record)
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_write(self._wake, 1)
+        if is_new:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_write(self._wake, 1)
 
     def close(self) -> None:
         """Stop the robot if it has a stop, and end the processes. May be called twice."""

@@ -86,8 +86,8 @@ class Ros2Config(NetworkConfig, prefix="robot.ros2."):
     """A robot on the network.
 
     Attributes:
-        command_hz: how often commands are sent [Hz]; a new one is sent at once if the last is old enough. 0: 50 Hz to a
-            base, 125 Hz to an arm.
+        command_hz: how often new commands are sent at the most [Hz]: at once, if the last new one is old enough. One
+            that stays is repeated half as often. 0: 50 Hz to a base, 125 Hz to an arm.
         timeout_s: without a sign of life of the brain's process for so long the robot brakes, without a command of the
             cerebellum it is stopped by its node [s].
         silence_s: a topic that sends nothing for so long is a fault [s]; by default 0.5, and 1 of scans. The robot type

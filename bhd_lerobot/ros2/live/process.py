@@ -66,7 +66,7 @@ class Stopper:
 
 
 class Sender(threading.Thread):
-    """Sends commands as they come, at most so often; the stop when they cease."""
+    """Sends commands as they come, at most so often; those that stay again and again, and the stop when they cease."""
 
     def __init__(self, spec: NodeSpec, channel: Channel, publishers: list[Publisher], wake: int) -> None:
         super().__init__(name="bhd-ros2-sender", daemon=True)
@@ -77,22 +77,24 @@ class Sender(threading.Thread):
     def run(self) -> None:
         """Send until the process is to end."""
         period = 1 / self._spec.command_hz
-        sent = 0.0
-        while not self._channel.words[Word.END] and os.getppid() == self._parent:
-            longest = period if self._channel.words[Word.DRIVEN] else max(period, _WAIT_S)
-            select.select([self._wake], [], [], max(0.0, sent + longest - time.monotonic()))
-            if (left := sent + period - time.monotonic()) > 0:
-                time.sleep(left)
-            with contextlib.suppress(BlockingIOError):
-                os.read(self._wake, 8)
+        # Between two that are new, what stays is never due: it would be sent just before what is new, and delay it.
+        again = min(2 * period, max(period, _WAIT_S))
+        words, sent, changed = self._channel.words, 0.0, 0.0
+        while not words[Word.END] and os.getppid() == self._parent:
+            longest = again if words[Word.DRIVEN] else max(period, _WAIT_S)
+            is_new, _, _ = select.select([self._wake], [], [], max(0.0, sent + longest - time.monotonic()))
+            if is_new:
+                time.sleep(max(0.0, changed + period - time.monotonic()))
+                os.eventfd_read(self._wake)
+                changed = time.monotonic()
             sent = time.monotonic()
             self.step()
-        self._channel.words[Word.END] = 1
-        if self._channel.words[Word.DRIVEN]:
+        words[Word.END] = 1
+        if words[Word.DRIVEN]:
             for _ in range(5):
                 self._stopper.send()
                 time.sleep(_AGAIN_S)
-            self._channel.words[Word.DRIVEN] = 0
+            words[Word.DRIVEN] = 0
 
     def step(self) -> None:
         """Send the newest command, or the stop if it is too old."""

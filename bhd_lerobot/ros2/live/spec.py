@@ -115,8 +115,8 @@ class NodeSpec:
     """A node.
 
     Attributes:
-        command_hz: a command is sent at once, but at most so often; without a new one, the last is repeated as often
-            [Hz].
+        command_hz: a new command is sent at once, but at most so often [Hz]; without one, the last is repeated half as
+            often.
         timeout_s: without a command for so long the stop is sent instead [s].
         is_synchronised: whether the clocks of the other machines are that of this one.
         is_alone: whether another publisher on a topic that is sent is a problem.

@@ -16,6 +16,8 @@ from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.live.spec import InputSpec, NodeSpec, OutputSpec, silence_text
 from bhd_lerobot.ros2.messages.scan import ScanReader
 
+_NEARLY = 0.9  # of `moves`: a robot that is to move just so fast reads a little less
+
 
 def scan_reader(network: Ros2Config, topic: str, lidar: LidarSpec, beams: int) -> ScanReader:
     """Return what reads the scans of a robot, mounted as its options or ``/tf_static`` state."""
@@ -88,7 +90,7 @@ class Ros2Plant(Plant):
     def read(self, out: PlantReading) -> None:
         """Write the newest readings into `out`."""
         self.read_parts(self.state(), out)
-        if self.followed_s is None and self._commanded_ns and self.moved(out) >= self.moves:
+        if self.followed_s is None and self._commanded_ns and self.moved(out) >= _NEARLY * self.moves:
             self.followed_s = (time.monotonic_ns() - self._commanded_ns) / 1e9
 
     def commanded(self, ctrl: np.ndarray) -> float:
