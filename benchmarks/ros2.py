@@ -1,9 +1,10 @@
 """Our robots on ROS 2 beside a pair of plain `rclpy` nodes: `python -m benchmarks.ros2`.
 
-Latencies of commands, processor time, how regular topics are, with and without a process beside it that computes all
-the time; and how long a robot goes on when one of the processes that drive it is killed or stopped. Every ratio is to
-the plain pair in the same run, the median of some rounds. It needs the ROS 2 environment of the tests, which it
-installs on first use. Exits with 3 if a goal is missed, with 2 if nothing can be measured here.
+Latencies of commands, also through a bridge, processor time, how regular topics are, with and without a process beside
+it that computes all the time; and how long a robot goes on when one of the processes that drive it is killed or
+stopped. Every ratio is to the plain pair, or a plain relay, in the same run, the median of some rounds. It needs the
+ROS 2 environment of the tests, which it installs on first use. Exits with 3 if a goal is missed, with 2 if nothing can
+be measured here.
 """
 
 import contextlib
@@ -36,6 +37,7 @@ from tests.ros2.peer_env import Peer
 WARM_UP_S = 3.0
 BUSY = "beside a busy process"
 READ = ("--topic=scan:5", "--topic=imu:20", "--topic=joint_states:20")  # what our plant of a base receives
+PERIOD_S = 0.005  # of the control loop of a base
 LIMIT_S = 0.7  # to standstill: 0.5 s and the plant's time-out, 0.2 s
 KILLED = {  # a part of its command line; the brain's is the process that the others belong to
     "brain": "",
@@ -73,26 +75,23 @@ class Session:
         return topics
 
     @contextlib.contextmanager
-    def program(self, *arguments: object) -> Iterator["subprocess.Popen[str]"]:
+    def program(self, module: str, *arguments: object) -> Iterator["subprocess.Popen[str]"]:
         """Run a program of ours, until it is ready and from then on until the end."""
-        command = [
-            sys.executable,
-            "-m",
-            "benchmarks._ros2_programs",
-            *map(str, arguments),
-            "--domain",
-            str(self.domain),
-        ]
+        command = [sys.executable, "-m", module, *map(str, arguments)]
         with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
             assert process.stderr is not None
             try:
                 for line in process.stderr:
-                    if "is a ROS 2 robot" in line:
+                    if "Ctrl-C ends it" in line:
                         break
                 yield process
             finally:
                 process.send_signal(signal.SIGINT)
                 process.stderr.read()
+
+    def serve(self, *arguments: object) -> contextlib.AbstractContextManager["subprocess.Popen[str]"]:
+        """Serve a robot."""
+        return self.program("benchmarks._ros2_programs", "serve", "--domain", self.domain, *arguments)
 
     # --- what is measured --------------------------------------------------------------------------------------------
 
@@ -103,7 +102,7 @@ class Session:
             self.numbers[f"plain p{percent}{end}"] = topics["cmd_vel"][f"latency_p{percent}"]
         with tempfile.TemporaryDirectory() as folder:
             times = Path(folder) / "times"
-            with self.program("serve", "--times", times), self.plain("publish", "--set=command") as publisher:
+            with self.serve("--times", times), self.plain("publish", "--set=command") as publisher:
                 publisher.wait_event("processor")
             found = json.loads(times.read_text())
         for name, values in found.items():
@@ -111,11 +110,26 @@ class Session:
             for percent in (50, 99):
                 self.numbers[f"{name} p{percent}{end}"] = float(np.percentile(used, percent))
 
+    def bridged(self) -> None:
+        """Measure the latency of a twist from a brain's topic to a robot's: of a plain relay, and of our bridge."""
+        bridge = ("bridge", "--robot.type=turtlebot3", "--robot.plant=ros2", f"--robot.ros2.domain={self.domain}")
+        ways: dict[str, Any] = {
+            "relay": Peer("plain_relay.py", "relay", domain=self.domain),
+            "bridge": self.program("bhd_lerobot.cli.ros2", *bridge, "--robot.ros2.latency_s=1"),
+        }
+        with Peer("standin_turtlebot3.py", "--open", "--half=200", domain=self.domain) as robot:
+            robot.wait_event("ready")
+            for name, way in ways.items():
+                with way, Peer("plain_relay.py", "measure", *self._window, domain=self.domain) as measuring:
+                    summary = measuring.wait_event("summary")
+                for key in ("p50", "p99", "missed"):
+                    self.numbers[f"{name} {key}"] = summary[key]
+
     def published(self, robot: str, hz: int, end: str = "") -> None:
         """Measure how regular topics are, and what publishing them costs."""
         self._note_errors(f"plain {robot}", self.pair(f"{robot} published{end}", f"--set={robot}"), end)
         with (
-            self.program("serve", "--robot", robot, "--hz", hz) as process,
+            self.serve("--robot", robot, "--hz", hz) as process,
             self.plain("subscribe", f"--set={robot}") as subscriber,
         ):
             subscriber.wait_event("ready")
@@ -211,6 +225,7 @@ def measure(domain: int, measure_s: float) -> dict[str, float]:
     session.received("ur5", arm, ("ur_driver_standin.py", "--hz=500"), ("--set=ur5",))
     session.published("ur5", 500)
     session.commands()
+    session.bridged()
     session.published("turtlebot3", 125)
     with _busy():
         session.commands(f", {BUSY}")
@@ -245,6 +260,12 @@ def report(rounds: list[dict[str, float]], stops: dict[str, float]) -> Report:
             what = f"error of the interval of /{topic} [ms], p99{end}"
             names = f"ours turtlebot3 /{topic}{end}", f"plain turtlebot3 /{topic}{end}"
             compare(what, *names, 1.0)
+    what = "latency of a twist from a brain's topic through the bridge to the robot's [ms], p"
+    compare(f"{what}50", "bridge p50", "relay p50", 1.3)
+    compare(f"{what}99", "bridge p99", "relay p99")
+    late = statistics.median(series["bridge p99"])
+    found.add("the 99th percentile against a control period", f"{1e3 * late:.2f} ms", f"at most {1e3 * PERIOD_S:g} ms",
+              met=late <= PERIOD_S)  # fmt: skip
     what = "error of the interval of a UR5's /joint_states at 500 Hz [ms], p99"
     compare(what, "ours ur5 /joint_states", "plain ur5 /joint_states", 1.0)
     for robot, name in (("turtlebot3", "TurtleBot3's topics"), ("ur5", "UR5's joint states at 500 Hz")):
