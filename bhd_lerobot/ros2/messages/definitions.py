@@ -32,34 +32,6 @@ int8 ERROR_GOAL_TERMINATED=3
 int8 return_code
 action_msgs/GoalInfo[] goals_canceling
 """,
-    "type_description_interfaces/msg/FieldType": """
-uint8 type_id
-uint64 capacity
-uint64 string_capacity
-string<=255 nested_type_name
-""",
-    "type_description_interfaces/msg/Field": """
-string name
-FieldType type
-string default_value
-""",
-    "type_description_interfaces/msg/IndividualTypeDescription": """
-string<=255 type_name
-Field[] fields
-""",
-    "type_description_interfaces/msg/TypeDescription": """
-IndividualTypeDescription type_description
-IndividualTypeDescription[] referenced_type_descriptions
-""",
-    "type_description_interfaces/msg/TypeSource": """
-string type_name
-string encoding
-string raw_file_contents
-""",
-    "type_description_interfaces/msg/KeyValue": """
-string key
-string value
-""",
     "type_description_interfaces/srv/GetTypeDescription": """
 string type_name
 string type_hash

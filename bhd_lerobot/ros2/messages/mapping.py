@@ -179,11 +179,6 @@ class TopicFields:
         """How many features."""
         return len(self.columns)
 
-    @property
-    def has_header(self) -> bool:
-        """Whether a message begins with a header, and so with a stamp."""
-        return has_header(self.msgtype)
-
     def parts(self) -> "list[TopicFields]":
         """Return the features that come in the same message for certain, each that is selected by a name by itself."""
         named = [k for k, one in enumerate(self.fields) if one.key]
@@ -229,7 +224,7 @@ class TopicFields:
 
     def encode(self, features: NDArray[np.float64], stamp_ns: int) -> bytes:
         """Return a serialised message with the features, shape (len(columns),), and the stamp [ns] if it has one."""
-        tree: dict[str, Any] = {"header": header(np.array([stamp_ns]))} if self.has_header else {}
+        tree: dict[str, Any] = {"header": header(np.array([stamp_ns]))} if has_header(self.msgtype) else {}
         for one, value in zip(self.fields, (features - self.offsets) / self.scales, strict=True):
             one.put(tree, value)
         return encode(self.msgtype, tree, 1)[0]

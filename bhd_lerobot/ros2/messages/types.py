@@ -158,12 +158,15 @@ def require_rosbags() -> None:
 def type_store() -> Any:
     """Return `rosbags`' store of the standard types and ours.
 
-    The standard types that are used here are the same in all distributions since Foxy.
+    The standard types that are used here are the same in all distributions since Foxy; later ones have more.
     """
     require_rosbags()
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store, later = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS2_KILTED).fielddefs
+    # rosbags computes another hash than ROS of what service_msgs has.
+    new = [name for name in later if name not in store.fielddefs and not name.startswith("service_msgs/")]
+    store.register({name: later[name] for name in new})
     interfaces = resources.files(__package__).joinpath("msg")
     shipped = {
         f"{INTERFACES}/msg/{file.name.removesuffix('.msg')}": file.read_text("utf-8") for file in interfaces.iterdir()

@@ -4,7 +4,6 @@ What differs from the real ones is in docs/how_to/ros2.md, "Differences".
 """
 
 import time
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import LATCHED, Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages import ur, views
-from bhd_lerobot.ros2.messages.parts import Frames, header
+from bhd_lerobot.ros2.messages.parts import header, header_stamps
 from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.table import JOINTS
 from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
@@ -36,7 +35,7 @@ class ArmTopics(Topics):
     def __init__(
         self, host: LiveHost, node: Node, counts: Counts, view: views.RobotView, joint_states_hz: float
     ) -> None:
-        self._host, self._counts, self._view, self._rate_hz = host, counts, view, joint_states_hz
+        self._host, self._counts, self._view = host, counts, view
         self._names = [f"{joint}_joint" for joint in host.body.need(Arm).chain.joints]
         self._count = len(self._names)
         self._command: NDArray[np.float64] = host.bridge.state().command  # joints, then the gripper
@@ -48,26 +47,19 @@ class ArmTopics(Topics):
         self._scaling = node.publisher(ur.SCALING_TOPIC, ur.FLOAT)
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
-        self._inputs = [
+        self.inputs = [
             Input(node.subscription(ur.TRAJECTORY_TOPIC, ur.TRAJECTORY), self.follow),
             Input(node.subscription(ur.POSITION_TOPIC, ur.FLOATS), self._move),
             Input(node.subscription(ur.GRIPPER_TOPIC, ur.FLOATS), self._grip),
         ]
-        [self._full_speed] = encode(ur.FLOAT, {"data": 100.0}, 1)
+        [full_speed] = encode(ur.FLOAT, {"data": 100.0}, 1)
+        self.outputs = [
+            Output(joint_states_hz, self._publish),
+            Output(_TRANSFORMS_HZ, self._publish_transforms),
+            Output(_SPEED_SCALING_HZ, lambda _: self._scaling.send(full_speed)),
+        ]
         for message in views.static_transforms(view.frames, State.of(host).stamp_ns):
             self._static.send(message)
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [
-            Output(self._rate_hz, self._publish),
-            Output(_TRANSFORMS_HZ, self._publish_transforms),
-            Output(_SPEED_SCALING_HZ, lambda _: self._scaling.send(self._full_speed)),
-        ]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return self._inputs
 
     def trajectory(self) -> JointTrajectory | None:
         """Return the joint trajectory that is followed, or None."""
@@ -91,8 +83,7 @@ class ArmTopics(Topics):
     def _publish_transforms(self, state: State) -> None:
         angles = state.robot.joint_positions[0]
         motion = views.Motion({name: angles[k : k + 1] for k, name in enumerate(self._names)})
-        frames = Frames(0, np.zeros(1, np.int64), state.stamps)
-        for message in views.moving_transforms(self._view, frames, motion):
+        for message in views.moving_transforms(self._view, state.frames, motion):
             self._transforms.send(message)
 
     # --- commands ----------------------------------------------------------------------------------------------------
@@ -100,7 +91,7 @@ class ArmTopics(Topics):
     def follow(self, message: Any) -> bool:
         """Take a trajectory. Its stamp is its start, 0 is at once; until then what is followed goes on."""
         now = time.monotonic_ns()
-        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        [stamp] = header_stamps([message]).tolist()
         start_ns = now + (stamp - time.time_ns() if stamp else 0)
         try:
             trajectory = self._trajectory(message, now - start_ns)

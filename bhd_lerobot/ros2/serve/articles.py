@@ -1,7 +1,7 @@
 """The names of the articles: topics and messages of their bridge, beside ours."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -11,11 +11,12 @@ import numpy as np
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.errors import ConfigError, as_text
 from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.ros2 import messages
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.definitions import register_types
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode_known
-from bhd_lerobot.ros2.messages.types import INTERFACES, type_store
+from bhd_lerobot.ros2.messages.types import type_store
 from bhd_lerobot.ros2.serve.interface import Names
 from bhd_lerobot.ros2.serve.server import Input, Output, State, Topics
 
@@ -46,19 +47,13 @@ def article_names(articles: bool | str) -> tuple[Names, ...]:
     if not articles:
         return (Names(),)
     if articles is True:
-        package, names = PACKAGE, ("BrainCommand", "BrainResult", "CerebellumState")
-        texts = {name: _text_of(f"{INTERFACES}/msg/{name}") for name in names}
+        package, (_, texts) = PACKAGE, _package(Path(messages.__path__[0]))
     else:
         package, texts = _package(Path(articles).expanduser())
     register_types({f"{package}/msg/{name}": text for name, text in texts.items()})
     types = {role: _find(role, package, texts, articles) for role in _FIELDS}
     theirs = Names(COMMAND_TOPIC, RESULT_TOPIC, STATE_TOPIC, types["command"], types["result"], types["state"])
     return Names(), theirs
-
-
-def _text_of(name: str) -> str:
-    text, _ = type_store().generate_msgdef(name)
-    return str(re.split(r"^=+$", text, maxsplit=1, flags=re.MULTILINE)[0])  # without those of its parts
 
 
 def _package(folder: Path) -> tuple[str, dict[str, str]]:
@@ -97,15 +92,8 @@ class TrajectoryController(Topics):
     def __init__(self, host: LiveHost, node: Node, follow: Callable[[Any], bool]) -> None:
         self._joints = [f"{joint}_joint" for joint in host.body.need(Arm).chain.joints]
         self._publisher = node.publisher(CONTROLLER_TOPIC, CONTROLLER)
-        self._inputs = [Input(node.subscription(TRAJECTORY_TOPIC, "trajectory_msgs/msg/JointTrajectory"), follow)]
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [Output(_STATE_HZ, self._publish)]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return self._inputs
+        self.outputs = [Output(_STATE_HZ, self._publish)]
+        self.inputs = [Input(node.subscription(TRAJECTORY_TOPIC, "trajectory_msgs/msg/JointTrajectory"), follow)]
 
     def _publish(self, state: State) -> None:
         count, robot = len(self._joints), state.robot

@@ -5,7 +5,6 @@ stops by itself when no command comes for `command_timeout_s`, where a real one 
 """
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -60,21 +59,17 @@ class BaseTopics(Topics):
         self._scan = node.publisher("/scan", ScanPart.msgtype)  # reliable: it serves both kinds of subscription
         for message in views.static_transforms(view.frames, State.of(host).stamp_ns):
             self._static.send(message)
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [Output(NODE_HZ, self._publish)]
+        self.outputs = [Output(NODE_HZ, self._publish)]
 
     def _publish(self, state: State) -> None:
-        robot, observation, stamps = state.robot, state.row["observation"], state.stamps
-        frames = Frames(0, np.zeros(1, np.int64), stamps)
+        robot, observation, frames = state.robot, state.row["observation"], state.frames
         moved = np.concatenate([observation[:, :2], robot.odometry], axis=1)
         angles, speeds = robot.joint_positions, robot.joint_velocities * self._drive.wheel_radius
         self._odometry.send(self._odometry_part.encode(frames, moved)[0])
         self._imu.send(self._gyro_part.encode(frames, observation[:, self._gyro])[0])
         self._joints.send(self._wheel_part.encode(frames, np.concatenate([angles, speeds], axis=1))[0])
         battery = {
-            "header": header(stamps),
+            "header": header(state.stamps),
             **{"voltage": _VOLTAGE, "temperature": math.nan, "current": math.nan, "charge": math.nan},
             **{"capacity": math.nan, "design_capacity": _CAPACITY, "percentage": 1.0, "present": True},
             **{"power_supply_status": _FULL, "power_supply_health": _GOOD, "power_supply_technology": _LIPO},

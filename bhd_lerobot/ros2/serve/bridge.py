@@ -1,7 +1,7 @@
 """`bhd-ros2 bridge`: the cerebellum between a brain on a ROS 2 network and a robot that is driven by a plant."""
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -35,10 +35,6 @@ class BridgeConfig(ServiceConfig):
         robot: the robot; `robot.plant` says how it is driven.
         network: where brains are; an option that is not given is that of `robot.ros2`.
         namespace: of the bridge's node; topics keep their names, which begin with a slash.
-        state_hz: how often ``/cerebellum/state`` is published [Hz].
-        duration_s: end after this time [s]; 0: run until Ctrl-C.
-        articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
-            messages (`package.xml` and `msg/`), whose fields are found by their names.
         record: what is recorded, and where.
     """
 
@@ -67,10 +63,7 @@ class Faults(Topics):
 
     def __init__(self, host: LiveHost, report: Callable[[str], None]) -> None:
         self._host, self._report, self._before, self._looks = host, report, host.bridge.latest.copy(), 0
-
-    def outputs(self) -> Iterable[Output]:
-        """Return a look at the mode, which publishes nothing."""
-        return [Output(10.0, self._look)]
+        self.outputs = [Output(10.0, self._look)]  # which publishes nothing
 
     def _look(self, state: State) -> None:
         before, mode = self._before, Mode(int(state.robot.mode[0]))

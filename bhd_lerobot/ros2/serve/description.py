@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from bhd_lerobot.control.commands import Pose
 from bhd_lerobot.ros2.live.network import LATCHED
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.serialize import encode
@@ -32,7 +33,7 @@ def urdf(name: str, view: RobotView, parts: Sequence[Part]) -> str:
     poses = {root: np.eye(4)}
     while len(poses) <= len(frames):
         poses |= {
-            frame.child: poses[frame.parent] @ _matrix(frame.position, frame.rotation)
+            frame.child: poses[frame.parent] @ Pose(frame.position, frame.rotation).matrix()
             for frame in frames
             if frame.parent in poses
         }
@@ -61,7 +62,7 @@ def urdf(name: str, view: RobotView, parts: Sequence[Part]) -> str:
         )
         ElementTree.SubElement(joint, "parent", link=frame.parent)
         ElementTree.SubElement(joint, "child", link=frame.child)
-        _add_origin(joint, _matrix(frame.position, frame.rotation))
+        _add_origin(joint, Pose(frame.position, frame.rotation).matrix())
         if turns:
             ElementTree.SubElement(joint, "axis", xyz="0 0 1")
     ElementTree.indent(robot)
@@ -122,18 +123,6 @@ def _add_origin(element: ElementTree.Element, pose: NDArray[np.float64]) -> None
     else:  # straight up or down, where only roll and yaw together count
         roll, yaw = np.arctan2(-turn[1, 2], turn[1, 1]), 0.0
     ElementTree.SubElement(element, "origin", xyz=_text(pose[:3, 3]), rpy=_text((roll, pitch, yaw)))
-
-
-def _matrix(position: Sequence[float], rotation: Sequence[float]) -> NDArray[np.float64]:
-    w, x, y, z = rotation
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    pose[:3, 3] = position
-    return pose
 
 
 def _text(numbers: Iterable[float]) -> str:

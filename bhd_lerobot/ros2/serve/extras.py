@@ -1,6 +1,5 @@
 """Topics by option: images and the clock."""
 
-from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -34,16 +33,13 @@ class CameraTopics(Topics):
             name: node.publisher(f"{one}/camera_info", views.CAMERA_INFO, SENSOR_DATA) for name, one in prefix.items()
         }
         host.start_rendering()
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [Output(self._host.rates.fps, self._publish)]
+        self.outputs = [Output(host.rates.fps, self._publish)]
 
     def _publish(self, state: State) -> None:
         if self._pending:  # the renderer is behind
             return
         self._host.latest()
-        frames = Frames(0, np.zeros(1, np.int64), state.stamps)
+        frames = state.frames
         for name, (height, width, _) in self._host.camera_shapes.items():
             frame = f"{name}_optical_frame"
             [info] = views.camera_info(frames, frame, (height, width), self._view.fovy[name])
@@ -61,10 +57,7 @@ class ClockTopic(Topics):
 
     def __init__(self, node: Node) -> None:
         self._clock = node.publisher("/clock", _CLOCK, SENSOR_DATA)
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [Output(CLOCK_HZ, self._publish)]
+        self.outputs = [Output(CLOCK_HZ, self._publish)]
 
     def _publish(self, state: State) -> None:
         fields: dict[str, Any] = {"clock": stamp_tree(state.stamps)}

@@ -1,7 +1,7 @@
 """Pose goals of a brain in another process: an arm's cerebellum follows them; a base is driven to them."""
 
 import math
-from typing import Protocol
+from typing import override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ _REST, _REST_TURN = 0.03, 0.15  # [m/s], [rad/s], likewise
 _ONE = np.zeros(1, np.intp)
 
 
-class Goals(Protocol):
+class Goals:
     """Follows one goal at a time.
 
     Attributes:
@@ -32,36 +32,39 @@ class Goals(Protocol):
 
     def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
         """Take a goal; return the refusal, or None."""
+        raise NotImplementedError
 
     def take_results(self) -> list[CommandResult]:
-        """Return how goals ended, each once."""
+        """Return how goals ended, each once; not those that were refused."""
+        raise NotImplementedError
 
     def interrupt(self) -> None:
-        """End the goal: a setpoint has come, and the newer command counts."""
+        """End the goal: a setpoint has come, and the newer command counts. By default the cerebellum sees that."""
 
     def poll(self, now_ns: int) -> int:
         """Do what is due at a monotonic time [ns]; return when there is more to do."""
+        return NEVER_NS
 
 
-class ArmGoals:
+class ArmGoals(Goals):
     """Goals of an arm, which its cerebellum follows."""
 
-    frames: tuple[str, ...] = (ARM_FRAME,)
+    frames = (ARM_FRAME,)
     timeout_s = 20.0
 
     def __init__(self, host: LiveHost) -> None:
         self._bridge = host.bridge
         self._refused: list[CommandResult] = []
 
+    @override
     def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
-        """Take a goal; return the refusal, or None."""
         refusal = self._bridge.submit(command)
         if refusal is not None:
             self._refused.append(refusal)
         return refusal
 
+    @override
     def take_results(self) -> list[CommandResult]:
-        """Return how goals ended; a refusal was returned already."""
         ended = []
         for result in self._bridge.take_results():
             if result in self._refused:
@@ -70,15 +73,8 @@ class ArmGoals:
                 ended.append(result)
         return ended
 
-    def interrupt(self) -> None:
-        """Do nothing: the cerebellum sees the setpoint."""
 
-    def poll(self, now_ns: int) -> int:
-        """Return that nothing is due."""
-        return NEVER_NS
-
-
-class BaseGoals:
+class BaseGoals(Goals):
     """Goals of a base, which the brain `navigator` drives to, by the scan and the odometry.
 
     A goal ends the one before. It is reached within 0.1 m and 10 degrees, at rest.
@@ -87,7 +83,7 @@ class BaseGoals:
         host: the base, with odometry in its observation.
     """
 
-    frames: tuple[str, ...] = (FOOTPRINT_FRAME, ODOM_FRAME)
+    frames = (FOOTPRINT_FRAME, ODOM_FRAME)
     timeout_s = 120.0
 
     def __init__(self, host: LiveHost) -> None:
@@ -102,8 +98,8 @@ class BaseGoals:
         self._due_ns = self._end_ns = 0
         self._results: list[CommandResult] = []
 
+    @override
     def submit(self, command: BrainCommand, frame: str) -> CommandResult | None:
-        """Take a goal; return the refusal, or None."""
         if refusal := self._refusal(command):
             return refusal
         pose = command.target_pose
@@ -156,13 +152,13 @@ class BaseGoals:
         pose: NDArray[np.float64] = self._host.bridge.latest["state"]["odometry"]
         return pose
 
+    @override
     def take_results(self) -> list[CommandResult]:
-        """Return how goals ended, each once."""
         results, self._results = self._results, []
         return results
 
+    @override
     def interrupt(self) -> None:
-        """End the goal: a setpoint has come, and the newer command counts."""
         self._end(ResultCode.REPLACED_BY_SETPOINT, "A twist came, and the newer command counts.")
 
     def _end(self, code: ResultCode, text: str) -> None:
@@ -171,8 +167,8 @@ class BaseGoals:
             self._results.append(CommandResult(self._command.task_id, succeeded, code, text))
             self._command = None
 
+    @override
     def poll(self, now_ns: int) -> int:
-        """Drive for a frame; return when the next one begins [ns]."""
         if self._command is None:
             return NEVER_NS
         if now_ns < self._due_ns:

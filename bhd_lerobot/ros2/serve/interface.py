@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, override
 
@@ -64,7 +64,7 @@ class InterfaceTopics(Topics):
         ended: Callable[[CommandResult], None] = lambda result: None,
         names: Sequence[Names] = (Names(),),
     ) -> None:
-        self._host, self._counts, self._state_hz, self._goals, self._taken = host, counts, state_hz, goals, taken
+        self._host, self._counts, self._goals, self._taken = host, counts, goals, taken
         self._frame, self._ended = goals.frames[0], ended
         self._results_out = [(node.publisher(one.result, one.result_type, Qos(1000)), one.result_type) for one in names]
         self._states_out = [(node.publisher(one.state, one.state_type), one.state_type) for one in names]
@@ -75,23 +75,16 @@ class InterfaceTopics(Topics):
         commands = dict.fromkeys((one.command, one.command_type) for one in names)
         # The stop comes after the reset: of two that arrive together the robot stays stopped. A publisher that is best
         # effort presses, too.
-        self._inputs = [
+        self.inputs = [
             Input(node.subscription(RESET_TOPIC, "std_msgs/msg/Empty"), self._reset),
             *(Input(node.subscription(ESTOP_TOPIC, BOOL, qos), self._stop, "different") for qos in (EVERY, LOSSY)),
             *(Input(node.subscription(*one, EVERY), self._submit, "each", self._has_room) for one in commands),
         ]
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [
-            Output(self._state_hz, self._publish),
+        self.outputs = [
+            Output(state_hz, self._publish),
             Output(_RESULTS_HZ, self._publish_results),
             Output(_DIAGNOSTICS_HZ, self._publish_diagnostics),
         ]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return self._inputs
 
     def poll(self, now_ns: int) -> int:
         """Follow the goal; return when there is more to do [ns]."""

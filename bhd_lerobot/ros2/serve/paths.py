@@ -1,7 +1,7 @@
 """Paths for viewers: where an arm's tool is going to move, and where a base has driven."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,10 +43,7 @@ class PlannedPath(Topics):
         self._shown: Any = None  # the plan that was published last
         self._path = node.publisher(PLAN_TOPIC, PATH, LATCHED)
         self._goal = node.publisher(GOAL_TOPIC, POSE, LATCHED)
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [Output(_PLAN_HZ, self._publish)]
+        self.outputs = [Output(_PLAN_HZ, self._publish)]
 
     def _publish(self, state: State) -> None:
         followed: Any = self._trajectory()
@@ -78,10 +75,7 @@ class DrivenPath(Topics):
     def __init__(self, node: Node) -> None:
         self._poses: deque[Any] = deque(maxlen=_DRIVEN_HZ * _DRIVEN_S)
         self._path = node.publisher(DRIVEN_TOPIC, PATH)
-
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published."""
-        return [Output(_DRIVEN_HZ, self._publish)]
+        self.outputs = [Output(_DRIVEN_HZ, self._publish)]
 
     def _publish(self, state: State) -> None:
         x, y, yaw = state.robot.odometry[0]

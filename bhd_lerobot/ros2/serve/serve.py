@@ -36,12 +36,6 @@ class ServeConfig(ServiceConfig):
 
     Attributes:
         robot: the robot, one that this package simulates.
-        network: where other nodes are.
-        namespace: of the robot's node; topics keep their names, which begin with a slash.
-        state_hz: how often ``/cerebellum/state`` is published [Hz].
-        duration_s: end after this time [s]; 0: run until Ctrl-C.
-        articles: topics under the names of the articles as well: ``true``, or the folder of your own package of
-            messages (`package.xml` and `msg/`), whose fields are found by their names.
         joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
         clock: publish ``/clock`` as well.
         view: show the simulation in MuJoCo's viewer, a window on this machine. Closing the window does not end the

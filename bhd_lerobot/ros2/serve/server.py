@@ -1,7 +1,7 @@
 """The loop of a served robot: commands in as they arrive, topics out on fixed grids of time."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.graph import UNNAMED
 from bhd_lerobot.ros2.live.node import Node, Subscription
+from bhd_lerobot.ros2.messages.parts import Frames
 
 _LONGEST_WAIT_S = 0.02
 _NAMES_NS = 4 * NANOSECONDS  # the name of a node of Fast DDS comes up to a heartbeat of 3 s after its topics
@@ -42,6 +43,11 @@ class State:
     def stamps(self) -> NDArray[np.int64]:
         """The stamp [ns], shape (1,)."""
         return np.array([self.stamp_ns])
+
+    @property
+    def frames(self) -> Frames:
+        """What messages are made for."""
+        return Frames(0, np.zeros(1, np.int64), self.stamps)
 
 
 @dataclass
@@ -134,15 +140,15 @@ NEVER_NS = 1 << 62
 
 
 class Topics:
-    """Some topics of a robot."""
+    """Some topics of a robot.
 
-    def outputs(self) -> Iterable[Output]:
-        """Return what is published at fixed rates."""
-        return ()
+    Attributes:
+        outputs: what is published at fixed rates.
+        inputs: what commands the robot.
+    """
 
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return ()
+    outputs: Sequence[Output] = ()
+    inputs: Sequence[Input] = ()
 
     def poll(self, now_ns: int) -> int:
         """Do what is due at a monotonic time [ns]; return when there is more to do."""
@@ -157,8 +163,8 @@ class Server:
 
     def __init__(self, host: LiveHost, node: Node, parts: Iterable[Topics], counts: Counts) -> None:
         self._host, self._node, self._parts, self.counts = host, node, list(parts), counts
-        self._outputs = [output for part in self._parts for output in part.outputs()]
-        self._inputs = [one for part in self._parts for one in part.inputs()]
+        self._outputs = [output for part in self._parts for output in part.outputs]
+        self._inputs = [one for part in self._parts for one in part.inputs]
         # Any number of nodes may press the emergency stop.
         self._commands = {
             one.subscription.topic for one in self._inputs if "/emergency_stop" not in one.subscription.topic

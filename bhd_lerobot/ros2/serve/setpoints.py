@@ -1,6 +1,6 @@
 """Setpoints that are streamed to a robot: twists to a base, joint positions to an arm."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,7 @@ class Setpoints(Topics):
         # Twists of Jazzy, and those of Humble and of most tutorials.
         types = (ur.FLOATS,) if is_arm else (STAMPED_TWIST, TWIST_TYPE)
         take = self._move if is_arm else self._drive
-        self._inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
-
-    def inputs(self) -> Iterable[Input]:
-        """Return what commands the robot."""
-        return self._inputs
+        self.inputs = [Input(node.subscription(topic, msgtype), take) for msgtype in types]
 
     def _drive(self, message: Any) -> bool:
         twist = getattr(message, "twist", message)

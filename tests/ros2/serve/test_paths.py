@@ -91,7 +91,7 @@ def test_the_path_is_the_tools_from_here_to_the_goal_while_the_goal_is_followed(
     robot, node, trajectory = Robot(), Node(), plan(command)
     host: Any = robot
     part = PlannedPath(host, node, lambda: None)  # type: ignore[arg-type]
-    [output] = part.outputs()
+    [output] = part.outputs
     robot.planner.newest = trajectory
     for phase in (None, GoalPhase.CONVERTING, GoalPhase.ERROR):
         robot.phase = phase
@@ -137,7 +137,7 @@ def test_a_joint_trajectory_of_the_topic_has_a_path_too() -> None:
     ]
     host: Any = Robot()
     node: Any = Node()
-    [output] = PlannedPath(host, node, lambda: followed[0]).outputs()
+    [output] = PlannedPath(host, node, lambda: followed[0]).outputs
     output.publish(STATE)
     [path], [goal] = node.sent[PLAN_TOPIC], node.sent[GOAL_TOPIC]
     assert vector(path.poses[0].pose) == pytest.approx(tool(HOME), abs=1e-12)
@@ -152,7 +152,7 @@ def test_a_joint_trajectory_of_the_topic_has_a_path_too() -> None:
 def test_the_path_of_a_base_is_that_of_the_last_minute_and_is_made_where_somebody_receives_it() -> None:
     node: Any = Node()
     node.receivers = 0
-    [output] = DrivenPath(node).outputs()
+    [output] = DrivenPath(node).outputs
     assert output.rate_hz == 5
     for k in range(400):
         if k == 399:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from bhd_lerobot.ros2.live.network import Qos
 from bhd_lerobot.ros2.live.node import MOST_TAKEN, Node, Received, Subscription
@@ -18,22 +17,6 @@ type _Kind = tuple[bool, bool]
 _PLAIN: _Kind = False, False
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """A message, and when it came.
-
-    Attributes:
-        sent_ns: when it was sent, on the sender's wall clock [ns].
-        since_ns: when one was looked for before, on the monotonic clock of this machine [ns].
-        arrived_ns: when it was found, on the same clock [ns].
-    """
-
-    data: bytes
-    sent_ns: int
-    since_ns: int
-    arrived_ns: int
-
-
 class TopicReceiver:
     """Receives the messages of a type on a topic, each once.
 
@@ -41,6 +24,9 @@ class TopicReceiver:
     effort, and one without history not what a latched topic sent before. A reliable one may receive nothing of a
     publisher of Fast DDS until its heartbeat comes, seconds later; so until each publisher was heard reliably, it is
     heard best effort as well.
+
+    Attributes:
+        taken_ns: when messages were looked for last, monotonic [ns].
     """
 
     def __init__(self, node: Node, topic: str, msgtype: str) -> None:
@@ -50,7 +36,7 @@ class TopicReceiver:
         self._heard: set[int] = set()  # publishers, by another subscription than the plain one
         self._seen: dict[tuple[int, int, int], None] = {}
         self._forget_ns = 0  # when those that were seen by one subscription have been seen by the other
-        self._since_ns = time.monotonic_ns()
+        self.taken_ns = time.monotonic_ns()
 
     def update(self, offered: Collection[Qos]) -> None:
         """Have the subscriptions that publishers now need."""
@@ -68,11 +54,11 @@ class TopicReceiver:
                 f"rt{self.topic}", self.msgtype, Qos(DEPTH, reliable, transient_local)
             )
 
-    def take(self) -> list[Arrival]:
+    def take(self) -> list[Received]:
         """Return what has arrived since the last call, of each publisher in the order of sending."""
         found: list[Received] = []
-        since_ns, self._since_ns = self._since_ns, time.monotonic_ns()
-        if self._seen and len(self._subscriptions) == 1 and self._since_ns > self._forget_ns:
+        self.taken_ns = time.monotonic_ns()
+        if self._seen and len(self._subscriptions) == 1 and self.taken_ns > self._forget_ns:
             self._seen.clear()
         several = len(self._subscriptions) > 1 or bool(self._seen)
         for kind, one in self._subscriptions.items():
@@ -84,7 +70,7 @@ class TopicReceiver:
                     break
         if several:
             found.sort(key=lambda message: message.sent_ns)
-        return [Arrival(one.data, one.sent_ns, since_ns, one.arrived_ns) for one in found]
+        return found
 
     def _is_new(self, message: Received) -> bool:
         key = message.sender, message.sent_ns, len(message.data)

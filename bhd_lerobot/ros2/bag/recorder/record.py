@@ -192,11 +192,11 @@ class Recorder:
         shift_ns = time.time_ns() - time.monotonic_ns()
         found: list[tuple[int, Any, bytes]] = []
         for key, one in self._recorded.items():
-            arrivals = one.receiver.take()
+            since_ns, arrivals = one.receiver.taken_ns, one.receiver.take()
             if not arrivals:
                 continue
             for arrival in arrivals:
-                received = min(max(arrival.sent_ns - shift_ns, arrival.since_ns), arrival.arrived_ns) + self._wall_ns
+                received = min(max(arrival.sent_ns - shift_ns, since_ns), arrival.arrived_ns) + self._wall_ns
                 one.last_ns = max(one.last_ns, received)
                 found.append((one.last_ns, one.connection, arrival.data))
             self.report.counts[key] += len(arrivals)
