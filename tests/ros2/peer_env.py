@@ -1,7 +1,8 @@
 """The environment with the real ROS 2 client library, and processes in it to test against.
 
 It is made once per version of the files that describe it, in .ros/ of this checkout. It is never the tests'
-own: every start of Python in it sets LD_LIBRARY_PATH and executes itself again.
+own: every start of Python in it sets LD_LIBRARY_PATH and executes itself again. ``BHD_ROS=jazzy`` takes the one of
+another distribution.
 """
 
 import contextlib
@@ -31,7 +32,7 @@ from tests.waiting import until
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 CACHE = ROOT / ".ros"
-DISTRIBUTION = "kilted"
+DISTRIBUTION = os.environ.get("BHD_ROS", "kilted")
 MESSAGES = {
     "bhd_interfaces": ROOT / "bhd_lerobot/ros2/messages",
     "tf2_msgs": HERE / "messages/tf2_msgs",

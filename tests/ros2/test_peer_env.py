@@ -15,6 +15,6 @@ def test_without_ros_a_test_is_skipped_which_make_test_repeats_and_fails_in_ci(
     monkeypatch.setattr(peer_env, "_environment", lambda: peer_env.UnavailableError("no network"))
     monkeypatch.setenv(requirements.REQUIRE, required)
     monkeypatch.setenv(requirements.REASONS, str(reasons))
-    with pytest.raises(outcome, match=r"no ROS 2 kilted .*: no network"):
+    with pytest.raises(outcome, match=rf"no ROS 2 {peer_env.DISTRIBUTION} .*: no network"):
         peer_env.environment()
     assert len(reasons.read_text().splitlines()) == (required == "0")
