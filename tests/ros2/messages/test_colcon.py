@@ -21,19 +21,20 @@ assert all(deserialize_message(serialize_message(one), type(one)) == one for one
 
 
 def install(folder: Path) -> None:
-    """Make an environment with ROS and colcon, whose wheels find this Python."""
+    """Make an environment with ROS and colcon, whose wheels find this Python, and whose programs its final place."""
     peer_env._install(REQUIREMENTS, folder)
-    [site] = folder.glob("lib/python*/site-packages")
-    here = {
+    final, (site, *_) = folder.with_suffix(""), folder.glob("lib/python*/site-packages")
+    changes = {
         f"{WHEELS}/include/python3.12": sysconfig.get_path("include"),
-        f"{WHEELS}/lib/python3.12/site-packages": site,
+        f"{WHEELS}/lib/python3.12/site-packages": str(final / site.relative_to(folder)),
+        str(folder): str(final),
     }
-    for file in (folder / "share").rglob("*.cmake"):
-        text = file.read_text("utf-8")
-        if WHEELS in text:
-            for there, path in here.items():
-                text = text.replace(f"{WHEELS}/{there}", str(path))
-            file.write_text(text, "utf-8")
+    for file in (*(folder / "share").rglob("*.cmake"), *(one for one in (folder / "bin").iterdir() if one.is_file())):
+        data = before = file.read_bytes()
+        for there, here in changes.items() if file.suffix == ".cmake" or data.startswith(b"#!") else ():
+            data = data.replace(there.encode(), here.encode())
+        if data != before:
+            file.write_bytes(data)
 
 
 @pytest.mark.thorough
@@ -48,11 +49,9 @@ def test_colcon_builds_the_package_of_our_messages_as_it_is(tmp_path: Path) -> N
     variables = peer_env.RosEnvironment(python, None).variables(0)
     variables |= {"PATH": f"{home / 'bin'}:{os.environ['PATH']}", "CMAKE_PREFIX_PATH": str(home)}
     variables["AMENT_PREFIX_PATH"] = str(home)
-    folders = [
-        f"--{name}={tmp_path / folder}" for name, folder in (("build-base", "build"), ("install-base", "install"))
-    ]
-    command = ["colcon", f"--log-base={tmp_path / 'log'}", "build", f"--base-paths={tmp_path / 'src'}", *folders]
-    peer_env._run([*command, "--cmake-args", f"-DPython3_EXECUTABLE={python}"], variables)
+    folders = [f"--{name}-base={tmp_path / name}" for name in ("build", "install")]
+    colcon = [home / "bin/colcon", f"--log-base={tmp_path / 'log'}", "build", f"--base-paths={tmp_path / 'src'}"]
+    peer_env._run([*colcon, *folders, "--cmake-args", f"-DPython3_EXECUTABLE={python}"], variables)
     [packages] = made.glob("lib/python*/site-packages")
     found = {"AMENT_PREFIX_PATH": f"{made}:{home}", "LD_LIBRARY_PATH": str(made / "lib"), "PYTHONPATH": str(packages)}
     peer_env._run([python, "-c", USE], variables | found)
