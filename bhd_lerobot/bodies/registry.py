@@ -12,7 +12,8 @@ from bhd_lerobot.options.registry import Registry
 
 _OWN: dict[str, Callable[[], Body] | str] = {  # those of files are added by `bhd_lerobot.registry`
     "turtlebot3": turtlebot3_burger,
-    **{name: partial(ur, name) for name in MODELS},
+    "ur5": ur5,  # the first arm: it stands for a robot that is not known
+    **{name: partial(ur, name) for name in MODELS if name != "ur5"},
     "arm": ur5,  # stands for the arms that are files
     "turtlebot3_manipulation": turtlebot3_manipulation,
 }

@@ -101,7 +101,7 @@ def prompt_interrupt(stopped: str) -> Iterator[None]:
 
     def leave() -> None:
         if not is_caught:
-            print(f"\nStopped; {stopped}.", file=sys.stderr)
+            print(f"\nStopped; {stopped}", file=sys.stderr)
         sys.stderr.flush()
         os._exit(130)
 

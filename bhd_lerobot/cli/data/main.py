@@ -50,8 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             stopped = options.stopped  # a command may say more while it runs
 
+    def interrupted() -> str:
+        text = ", ".join(done) or stopped
+        return f"Stopped; {text}" if "\n" in text else f"Stopped; {text}."  # a command on a line of its own ends there
+
     with noting_what_is_done() as done:
-        return exit_status(run, lambda: f"Stopped; {', '.join(done) or stopped}.")
+        return exit_status(run, interrupted)
 
 
 if __name__ == "__main__":

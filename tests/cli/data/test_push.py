@@ -154,7 +154,7 @@ def test_ctrl_c_ends_a_stalled_upload_at_once(lesson: Path, tmp_path: Path) -> N
     assert process.wait() == 130
     error = (tmp_path / "log").read_text()
     assert f"Stopped; the dataset at {lesson} is unchanged" in error
-    assert f"bhd-data push {lesson} me/d --no-card" in error
+    assert error.endswith(f"\n  bhd-data push {lesson} me/d --no-card\n")  # to be copied
     assert "Traceback" not in error
 
 
