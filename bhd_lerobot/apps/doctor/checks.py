@@ -277,9 +277,9 @@ def check_latency(outcome: Outcome, robots: dict[str, int], timeout_s: float) ->
         return [wrong("latency.error", _error(outcome), error=_error(outcome))]
     worst = outcome.value["max"]
     findings = []
-    for robot, rate in robots.items():
-        share = worst * rate
-        found = f"{robot}, {rate} Hz: at worst {worst * 1e6:.0f} µs late, {100 * share:.1f} % of {1e3 / rate:g} ms"
+    for rate in dict.fromkeys(robots.values()):
+        names, share = ", ".join(robot for robot in robots if robots[robot] == rate), worst * rate
+        found = f"{names}, {rate} Hz: at worst {worst * 1e6:.0f} µs late, {100 * share:.1f} % of {1e3 / rate:g} ms"
         values = {"rate": rate, "share": f"{100 * share:.0f} %", "timeout": f"{1e3 * timeout_s:g} ms"}
         # The newest reading came a period before the tick that is late.
         if worst + 1 / rate >= timeout_s:
