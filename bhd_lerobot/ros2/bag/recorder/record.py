@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from bhd_lerobot.datasets.storage.disk import write_errors
-from bhd_lerobot.errors import ConfigError, DatasetWriteError
+from bhd_lerobot.errors import ConfigError, DatasetWriteError, counted
 from bhd_lerobot.options.declared import OneOf, Options, Range
 from bhd_lerobot.ros2.bag.recorder.receive import DEPTH, TopicReceiver
 from bhd_lerobot.ros2.bag.storage.place import refuse_existing
@@ -125,29 +125,41 @@ class Recorder:
         """
         output = self._options.output
         with write_errors("record", output, "What was recorded before can be read."), self._stack:
-            begun = time.monotonic()
-            end = None if self._options.seconds is None else begun + self._options.seconds
-            discover_at = flush_at = begun
-            is_full = False
-            while not stop() and not is_full and (end is None or time.monotonic() < end):
-                now = time.monotonic()
-                if now >= discover_at:
-                    self._discover()
-                    discover_at = now + (_EAGER_S if now < begun + _EAGER_FOR_S else _DISCOVER_S)
-                time.sleep(_POLL_S)
-                self._take()
-                if self._bag is not None and now >= flush_at:
-                    self._bag.flush()
-                    flush_at = now + _FLUSH_S
-                    is_full = shutil.disk_usage(output).free < LEAST_FREE
-            self._take()
+            try:
+                is_full = self._record(stop)
+            except Exception:
+                self._count_lost()
+                self._print_lost()
+                raise
             self._count_lost()
         if is_full:
+            self._print_lost()
             raise DatasetWriteError(
                 f"The disk of {output} has less than {LEAST_FREE >> 20} MiB left, so the recording was ended. The bag "
                 f"is complete up to here: {self.report.messages} messages. Free some space on this disk."
             )
         return self.report
+
+    def _record(self, stop: Callable[[], bool]) -> bool:
+        """Record until that is to end; return whether the disk is full."""
+        output = self._options.output
+        begun = time.monotonic()
+        end = None if self._options.seconds is None else begun + self._options.seconds
+        discover_at = flush_at = begun
+        is_full = False
+        while not stop() and not is_full and (end is None or time.monotonic() < end):
+            now = time.monotonic()
+            if now >= discover_at:
+                self._discover()
+                discover_at = now + (_EAGER_S if now < begun + _EAGER_FOR_S else _DISCOVER_S)
+            time.sleep(_POLL_S)
+            self._take()
+            if self._bag is not None and now >= flush_at:
+                self._bag.flush()
+                flush_at = now + _FLUSH_S
+                is_full = shutil.disk_usage(output).free < LEAST_FREE
+        self._take()
+        return is_full
 
     def _discover(self) -> None:
         publishers: dict[tuple[str, str], list[Endpoint]] = {}
@@ -213,3 +225,8 @@ class Recorder:
     def _count_lost(self) -> None:
         lost = {key: one.receiver.lost for key, one in self._recorded.items()}
         self.report.lost = {key: count for key, count in lost.items() if count}
+
+    def _print_lost(self) -> None:
+        """Print what a report would say, where an error takes its place."""
+        for (topic, _), count in self.report.lost.items():
+            self._print(f"{topic}: {counted(count, 'message')} lost.")
