@@ -1,11 +1,12 @@
 """How punctual the robots' control loop is on the wall clock: `make bench-realtime`.
 
-The TurtleBot3 ticks at 200 Hz and the UR5, with the objects of the pick task on its table, at 1 kHz. Three loops take
-turns in blocks of some seconds, quiet and under CPU load on every core: a C++ loop on an absolute grid with the same
-physics and nothing else; the robot as it is, driven by a brain; and the UR5 with two cameras, a torch brain that looks
-at them, and video that is encoded meanwhile. The table shows the lateness of the ticks, how long they take, and behind
-every time its ratio to that of a peer in the neighbouring block. Ticks that were missed are counted, and what the
-system refused is printed. Exits with 3 if a goal is missed, with 2 if nothing could be measured.
+The TurtleBot3 ticks at 200 Hz and the UR5, with the objects of the pick task on its table, at 1 kHz, with position
+servos and, only by `--robots=ur5_impedance`, with torque motors; or all at `--hz`. Three loops take turns in blocks of
+some seconds, quiet and under CPU load on every core: a C++ loop on an absolute grid with the same physics and nothing
+else; the robot as it is, driven by a brain; and the UR5 with two cameras, a torch brain that looks at them, and video
+that is encoded meanwhile. The table shows the lateness of the ticks, how long they take, and behind every time its
+ratio to that of a peer in the neighbouring block. Ticks that were missed are counted, and what the system refused is
+printed. Exits with 3 if a goal is missed, with 2 if nothing could be measured.
 """
 
 import os
@@ -31,7 +32,7 @@ from bhd_lerobot.control.fifo import RingReader
 from bhd_lerobot.datasets.format.features import dataset_features
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import RealtimeError
-from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
+from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain, RandomConfig
 from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.realtime.privileges import RealtimeSettings, SystemCalls
 from bhd_lerobot.registry import make_robot, make_simulation, robot_configs
@@ -40,7 +41,10 @@ from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
-RATES = {"turtlebot3": 200, "ur5": 1000}  # control ticks and physics steps a second [Hz]
+RATES = {"turtlebot3": 200, "ur5": 1000, "ur5_impedance": 1000}  # control ticks and physics steps a second [Hz]
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "ur5_impedance": ("ur5", {"control": "impedance", "tool_pose": True})
+}
 CONDITIONS = ("quiet", "load")
 TWIN, OURS, VIDEO = "C++ twin", "bhd-lerobot", "bhd-lerobot, torch and video"
 PEERS = {OURS: TWIN, VIDEO: OURS}
@@ -115,7 +119,8 @@ def summarise(ticks: Ticks, warm_up_s: float = WARM_UP_S) -> dict[str, float]:
 
 def configuration(robot: str, **options: Any) -> Any:
     """Return the configuration of a robot at the benchmark's rates."""
-    return robot_configs()[robot](control_hz=RATES[robot], physics_hz=RATES[robot], **options)  # type: ignore[call-arg]
+    kind, own = VARIANTS.get(robot, (robot, {}))
+    return robot_configs()[kind](control_hz=RATES[robot], physics_hz=RATES[robot], **own, **options)  # type: ignore[call-arg]
 
 
 def make_task(robot: str, fps: int, seconds: float = 60.0) -> Any:
@@ -130,7 +135,8 @@ def settled(robot: str) -> Any:
     config = configuration(robot)
     simulation = make_simulation(config, 1, 1)
     simulation.reset(np.zeros(1, np.intp), [make_task(robot, config.fps).sample(SEED)], [SEED])
-    simulation.world.step(RATES[robot] // 5)
+    for _ in range(config.fps // 5):
+        simulation.step(None)
     return simulation.world
 
 
@@ -202,7 +208,8 @@ def run_robot(robot: str, seconds: float, load: Load, folder: Path | None = None
     config = configuration(robot, id=f"bench-{os.getpid()}", clock="realtime", **cameras)
     with closing(make_robot(config)) as simulation:
         task = make_task(robot, config.fps, seconds)
-        brain, open_images = RandomBrain(RandomConfig(scale=0.05)), None
+        brain: Any = NoopBrain() if robot in VARIANTS else RandomBrain(RandomConfig(scale=0.05))
+        open_images = None
         if folder is not None:
             brain, open_images = NetworkBrain(), make_recorder(simulation, task, config, folder).begin_episode
             simulation.start_rendering()
@@ -435,13 +442,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments,
         blocks={"type": int, "help": "blocks for each loop and condition (default 6)"},
         seconds={"type": float, "help": "length of a block [s] (default 10)"},
-        robots={"nargs": "+", "choices": tuple(RATES), "default": list(RATES)},
+        robots={"nargs": "+", "choices": tuple(RATES), "default": ["turtlebot3", "ur5"]},
+        hz={"type": int, "help": "control ticks and physics steps a second [Hz] (default: each its own)"},
         conditions={"nargs": "+", "choices": CONDITIONS, "default": list(CONDITIONS)},
         quick=(False, "1 block of 1 s; its numbers are not to be quoted"),
     )
     blocks = (1 if options.quick else 6) if options.blocks is None else options.blocks
     seconds = (1.0 if options.quick else 10.0) if options.seconds is None else options.seconds
     check_lengths("blocks", blocks, seconds)
+    if options.hz is not None:
+        check_lengths("hz", options.hz, seconds)
+        RATES.update(dict.fromkeys(RATES, options.hz))
     busy = busy_share()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="bhd-bench-")))

@@ -1,5 +1,7 @@
 """The cerebellum: turns commands into safe actuator commands, one tick at a time. It owns the modes."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,7 @@ from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo
 from bhd_lerobot.control.guard import WireLimits
+from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.messages import (
     NANOSECONDS,
     SEQUENCE_STEP,
@@ -24,7 +27,7 @@ from bhd_lerobot.control.messages import (
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
 from bhd_lerobot.control.record import JOINTS, command_age_ns, new_states, put
-from bhd_lerobot.control.tick import drop_all, judge_all, tick_arms, tick_bases, tick_mobile_arms, tick_springs
+from bhd_lerobot.control.tick import drop_all, judge_all, report, tick_arms, tick_bases, tick_mobile_arms, tick_springs
 from bhd_lerobot.errors import ConfigError
 
 MOVING = 0.01  # [rad/s] a joint faster than this moves: `CerebellumState.is_moving`
@@ -52,11 +55,14 @@ class Cerebellum:
         fifo: where commands come from; a new one if None.
         estop: the word of the emergency stop, which any process may press; a new one if None.
         sensors: number of values that the plant reads beside those of the joints.
+        is_framed: whether whole frames in machine code are run in the place of its ticks, if that is possible.
 
     Attributes:
         states: the records of the robots, shape (n,): see `record`.
         numbers: the record of their limits, shape (1,).
         written: what is written to the plant, shape (n, actuators).
+        efforts: torques of the joints [N m], a gripper's force [N], as they were measured; where the plant does not
+            measure them, what its servos are commanded to give; shape (n, joints).
         readings: checks that what the plant reads can be a measurement of the present.
         now_ns: the time of the last tick [ns].
         may_write: whether it is known where the robots are: before, nothing is written.
@@ -73,6 +79,7 @@ class Cerebellum:
         fifo: CommandFifo | None = None,
         estop: EstopWord | None = None,
         sensors: int = 0,
+        is_framed: bool = False,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
@@ -96,10 +103,8 @@ class Cerebellum:
             states["stamp_ns"],
             numbers["has_stamps"],
         )
-        self._measured, self._pressed = states["measured"][:, :width], states["pressed"]
-        self._torque = states["torque"][:, : controller.joints]
-        self._wrench = states["wrench"][:, : controller.contact_wrench.shape[1]]
-        self._has_effort = None if controller.arm_limits is None else controller.arm_limits["has_effort"]
+        self._has_effort, self._measured = states["has_effort"], states["measured"][:, :width]
+        self.efforts = states["torque"][:, : controller.joints]
         if controller.monitors is not None:
             needed = max(int(controller.monitors["beams"].max()), int(numbers["gyro"][0]) + 1)
             if sensors < needed:  # compiled code would read beyond them
@@ -112,7 +117,7 @@ class Cerebellum:
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
         numbers["timeout_ns"], numbers["width"], numbers["has_sensors"] = self._timeout_ns, width, sensors > 0
         self.now_ns = 0
-        self.may_write = False
+        self.may_write, self._is_framed = False, is_framed
         self._dropped = np.zeros(n, np.int64)
         self._fifo = CommandFifo(n, width) if fifo is None else fifo
         self._estop = EstopWord(n) if estop is None else estop
@@ -126,7 +131,7 @@ class Cerebellum:
         if own.arms is not None:
             kind = tick_arms if own.monitors is None else tick_mobile_arms
         parts = own.monitors, own.arms, own.springs, self.numbers, own.arm_limits, own.geometries
-        self._run = kind.bind(*records, *parts, self.reading.sensors, sensors_ns)
+        self._run = kind.bind(*records, *parts, self.reading.sensors, sensors_ns, is_spare=self._is_framed)
         self._judge = judge_all.bind(states, self.numbers)
         self._drop_all = drop_all.bind(states, queues, self._dropped)
 
@@ -212,8 +217,7 @@ class Cerebellum:
         self.plant.read(reading)
         self._stamp_ns[:] = self.now_ns if reading.stamp_ns is None else reading.stamp_ns
         self._has_stamps[0] = reading.stamp_ns is not None
-        if self._has_effort is not None:
-            self._has_effort[0] = reading.has_effort
+        self._has_effort[:] = reading.has_effort
 
     def _tell_controller(self) -> None:
         """Tell the controller outside of a tick what it is to do."""
@@ -306,7 +310,7 @@ class Cerebellum:
         `RESET` of a latched emergency stop also acknowledges the presses that a tick has seen, or, of another process,
         the one `press` that it has seen latched; the next tick latches those that came later. `ACTIVATE` drops what
         still waits in the queue: no command from before it can start motion. Neither is accepted while a robot presses
-        on something (`Controller.pressed`).
+        on something (`CerebellumState.pressed`).
         """
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
@@ -325,7 +329,7 @@ class Cerebellum:
             allowed &= ~moving
         if request in (Request.RESET, Request.ACTIVATE):
             # Whatever is in its way would be pressed further, and nobody would know why.
-            pressed = applies & (self.controller.pressed() > 0.0)
+            pressed = applies & (self.states["pressed"] > 0.0)
             reasons[pressed] = Reason.PRESSED
             allowed &= ~pressed
         if request == Request.CONFIGURE:
@@ -403,40 +407,21 @@ class Cerebellum:
         self.states["watchdog"] = 0
         return self.controller.take_limits(), watchdog
 
-    def efforts(self) -> NDArray[np.float64]:
-        """Return the torques of the joints [N m], a gripper's force [N], shape (n, joints).
-
-        As they were measured; where the plant does not measure them, what its servos are commanded to give.
-        """
-        return self.reading.effort.copy() if self.reading.has_effort else self.controller.efforts(self.reading)
-
     def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
         """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
         ages: NDArray[np.int64] = command_age_ns(self.states, now_ns)
         return ages
 
-    def report(self) -> None:
-        """Complete the records with what only their readers need."""
-        controller, reading = self.controller, self.reading
-        self._measured[:] = controller.measured(reading)
-        self._torque[:] = reading.effort if reading.has_effort else controller.efforts(reading)
-        self._wrench[:], self._pressed[:] = controller.contact_wrench, controller.pressed()
-
     def state(self, now_ns: int) -> CerebellumState:
-        """Return a copy of the present state."""
-        self.report()
-        return self.reported(now_ns)
-
-    def reported(self, now_ns: int) -> CerebellumState:
         """Return a copy of what the records report, whether they are this cerebellum's own or another's."""
         velocity, odometry = self.reading.velocity.copy(), 0 if self.body.drive is None else 3
         return CerebellumState(
             stamp_ns=now_ns,
             joint_positions=self.reading.position.copy(),
             joint_velocities=velocity,
-            joint_efforts=self._torque.copy(),
-            contact_wrench=self._wrench.copy(),
-            pressed=self._pressed.copy(),
+            joint_efforts=self.efforts.copy(),
+            contact_wrench=self.controller.contact_wrench.copy(),
+            pressed=self.states["pressed"].copy(),
             command=self.command.copy(),
             odometry=self.states["odometry"][:, :odometry].copy(),
             measured=self._measured.copy(),
@@ -478,11 +463,20 @@ class Cerebellum:
         self.states["is_configured"] |= mask
         self.may_write = True  # before, it was not known where the robots are
         np.copyto(self.requested, self.command, where=mask[:, None])
+        own, limits = self.controller, _object(self.numbers)
+        for sim in ids.tolist():  # no tick has reported them yet
+            parts = (_object(part, sim) for part in (self.states, own.monitors, own.arms, own.springs))
+            report(*parts, limits, _object(own.arm_limits))
 
     def _start_writing(self, ids: NDArray[np.intp]) -> None:
         """Start from commands that the next ones need not be near to: robots were put or moved somewhere else."""
         self.written[ids], self._rate[ids] = self.controller.actuators[ids], 0.0
         self.states["same_effort"][ids] = self.states["written"][ids]  # no joint has to answer to this change
+
+
+def _object(records: NDArray | None, sim: int = 0) -> Any:
+    """Return the record of one robot, of which there may be one for all, as kernels take it; None if there are none."""
+    return None if records is None else as_objects(records[(at := sim % len(records)) : at + 1])[0]
 
 
 _TRACKING = int(Mode.TRACKING)  # numpy compares plain numbers faster

@@ -39,7 +39,7 @@ class Controller(ABC):
         protective_stop: the `Watchdog` flag of each robot that has just begun a stop of its own, shape (n,); 0 for the
             others.
         contact_wrench: what the surroundings put on the tools, estimated from the motors' efforts, in the base frame:
-            forces [N], and moments about the tool centre points [N m], shape (n, 6), or (n, 0) if nobody asks for it.
+            forces [N], and moments about the tool centre points [N m], shape (n, 6); 0 where it is not estimated.
         limits: the `Limit` flags raised since they were last taken, shape (n,).
     """
 
@@ -49,7 +49,6 @@ class Controller(ABC):
     actuators: NDArray[np.float64]
     busy: NDArray[np.bool_]
     protective_stop: NDArray[np.int64]
-    contact_wrench: NDArray[np.float64]
     limits: NDArray[np.int64]
     monitors: Any = None
     geometries: Any = None
@@ -60,6 +59,7 @@ class Controller(ABC):
             self.numbers["gyro"] = -1
         else:
             self.states, self.numbers = other.states, other.numbers
+        self.contact_wrench: NDArray[np.float64] = self.states["wrench"]
         self.arms: Any = None
         self.springs: Any = None
         self.arm_limits: Any = None
@@ -98,30 +98,15 @@ class Controller(ABC):
         """Why the last stop of its own was, as text."""
         return ""
 
-    def pressed(self) -> NDArray[np.float64]:
-        """Return the force with which each robot and something press on each other [N], shape (n,).
-
-        0 where it is small enough to reset and to activate the robot, and where it is not known.
-        """
-        return np.zeros(len(self.busy))
-
     def take_limits(self) -> NDArray[np.int64]:
         """Return the `Limit` flags raised since the last call, shape (n,), and clear them."""
         limits = self.limits.copy()
         self.limits[:] = 0
         return limits
 
-    @abstractmethod
-    def efforts(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return the commanded efforts of the servos [N m; N for a gripper], shape (n, joints)."""
-
     def odometry(self) -> NDArray[np.float64]:
         """Return x [m], y [m] and yaw [rad] since the start, shape (n, 3); shape (n, 0) for what does not drive."""
         return np.zeros((len(self.busy), 0))
-
-    def measured(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return where the robots really are in the space of the commands, shape (n, width)."""
-        return reading.position.copy()
 
     # --- goals: robots that take none refuse them --------------------------------------------------------------------
 

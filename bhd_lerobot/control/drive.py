@@ -246,6 +246,19 @@ def drive_back(state: Any, limits: Any) -> None:
     state.rate[0] = state.rate[1] = 0.0
 
 
+@kernel()
+def report_drive(state: Any, limits: Any) -> None:
+    """Write the twist that the wheels' speeds mean, and the torques of their servos, to the record."""
+    first = limits.arm_values
+    left, right = state.velocity[first], state.velocity[first + 1]
+    state.measured[first], state.measured[first + 1] = (left + right) * limits.half_radius, (right - left) * limits.turn
+    straight, turn = state.command[first] * limits.per_speed, state.command[first + 1] * limits.per_yaw
+    for k in range(first, first + 2):
+        error = (straight - turn if k == first else straight + turn) - state.velocity[k]
+        given = clamp(error, -limits.largest_error, limits.largest_error) * limits.servo_gain
+        state.torque[k] = state.effort[k] if state.has_effort else given
+
+
 class BaseController(Controller):
     """Twist commands to wheel speeds, for bases with two driven wheels.
 
@@ -289,7 +302,6 @@ class BaseController(Controller):
         self.command: Array = states["command"][:, first : first + 2]
         self.actuators: Array = states["actuators"][:, first : first + 2]
         self.busy, self.protective_stop, self.limits = (states[k] for k in ("busy", "protective_stop", "limits"))
-        self.contact_wrench = np.zeros((n, 0))
         per_yaw = drive.wheel_separation / 2 / drive.wheel_radius
         fastest = drive.max_wheel_speed / per_yaw
         if limits.velocity[1] > fastest * (1 + 1e-9):
@@ -311,7 +323,8 @@ class BaseController(Controller):
         numbers["stop"] = np.asarray(limits.stop_deceleration) / control_hz
         numbers["per_speed"], numbers["per_yaw"] = 1.0 / drive.wheel_radius, per_yaw
         numbers["most_wheel_speed"], numbers["half_radius"] = drive.max_wheel_speed, drive.wheel_radius / 2
-        numbers["turn"], numbers["largest_error"] = self._turn, drive.max_torque / drive.servo_gain
+        numbers["turn"], numbers["servo_gain"] = self._turn, drive.servo_gain
+        numbers["largest_error"] = drive.max_torque / drive.servo_gain
         numbers["counts"] = drive.encoder_ticks / (2 * np.pi)
         metres = drive.wheel_radius / numbers["counts"]  # that a wheel rolls in one encoder count
         numbers["per_count"], numbers["yaw_per_count"] = metres / 2, metres / drive.wheel_separation
@@ -363,13 +376,6 @@ class BaseController(Controller):
         if self.monitors["beams"][0]:
             forget_scans(self.monitors, ids)
 
-    def efforts(self, reading: PlantReading) -> Array:
-        """Return the torques of the servos [N m], shape (n, joints)."""
-        turn = self.command[:, 1:] * self.numbers["per_yaw"] * (-1.0, 1.0)
-        wheels = self.command[:, :1] * self.numbers["per_speed"] + turn
-        torque = (wheels - reading.velocity) * self.drive.servo_gain
-        return np.minimum(np.maximum(torque, -self.drive.max_torque), self.drive.max_torque)
-
     def odometry(self) -> Array:
         """Return x [m], y [m] and yaw [rad] since the start, from the encoders, shape (n, 3)."""
         return self.states["odometry"].copy()
@@ -383,10 +389,6 @@ class BaseController(Controller):
         out = np.empty((len(angles), 3))
         self._read_odometry(angles, out)
         return out
-
-    def measured(self, reading: PlantReading) -> Array:
-        """Return the twist that the wheels' speeds mean, shape (n, 2)."""
-        return twist_from_wheels(self.drive, reading.velocity)
 
 
 def twist_from_wheels(drive: Drive, wheels: Array) -> Array:

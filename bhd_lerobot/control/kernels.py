@@ -101,13 +101,14 @@ class Kernel[**P, R]:
         """Return how many values a loop over an array handles; a record stands for many."""
         return array.size * self.work if array.dtype.names else array.size
 
-    def bind(self, *bound: Any) -> Callable[..., R]:
+    def bind(self, *bound: Any, is_spare: bool = False) -> Callable[..., R]:
         """Return this kernel with its first arguments, to be called with the others.
 
-        It is compiled once it has handled `_values` values of its very first argument.
+        It is compiled once it has handled `_values` values of its very first argument; a spare one, which may never be
+        called, not before its first call.
         """
         self._check(0, bound)
-        if not _values or (_values < math.inf and "compiled" in vars(self)):  # by another one
+        if (not _values and not is_spare) or (_values < math.inf and "compiled" in vars(self)):  # by another one
             return partial(self.compiled, *bound)
         left, is_checked = _values, False
         python: Callable[..., R] = self.function

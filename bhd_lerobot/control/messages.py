@@ -194,8 +194,9 @@ class CerebellumState:
         joint_positions: joint or wheel angles [rad], a gripper's opening [m], shape (n, joints).
         joint_velocities: their speeds [rad/s, m/s], shape (n, joints).
         joint_efforts: torques of the joints [N m], force of a gripper [N], shape (n, joints); measured if possible.
-        contact_wrench: what the surroundings put on the tools, see `Controller.contact_wrench`.
-        pressed: the force that forbids to activate each robot [N], see `Controller.pressed`, shape (n,).
+        contact_wrench: what the surroundings put on the tools [N, N m], see `Controller.contact_wrench`, shape (n, 6).
+        pressed: the force with which each robot at rest and something press on each other [N], shape (n,); 0 where it
+            is small enough to reset and to activate the robot, and where it is not known.
         command: the command applied, after all limits, shape (n, width).
         measured: where the robot really is in the space of the commands, shape (n, width).
         odometry: x [m], y [m] and yaw [rad] since the last reset, from the encoders, shape (n, 3); shape (n, 0) for a

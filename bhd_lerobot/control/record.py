@@ -37,6 +37,7 @@ STATE = record(
         ("position", *_vector),  # [rad], a gripper's opening [m]
         ("velocity", *_vector),  # [rad/s, m/s]
         ("effort", *_vector),  # [N m, N]
+        ("has_effort", _b),  # they are measured
         ("stamp_ns", _i),  # when the hardware measured them, on the clock of the ticks' origin
         ("safety", np.int8),  # `SafetyStatus`
         # What they are checked with: see `reading_check`.
@@ -106,10 +107,10 @@ STATE = record(
         ("stood", _b),  # the wheels had not turned at all then
         ("stopped_at", _f, (4,)),  # [rad/s] of the wheels then, commanded and read
         ("late", _f, (2, LOOKS)),  # [rad/s] commanded between looks, the newest first
-        # Reports, see `Cerebellum.report`: written when somebody reads the record, not in the tick.
+        # Reports: nothing in here goes by them.
         ("measured", *_vector),  # where it is in the space of the commands
-        ("torque", *_vector),  # [N m] of the joints, a gripper's force [N]
-        ("wrench", _f, (6,)),  # [N, N m] that the surroundings put on the tool
+        ("torque", *_vector),  # [N m] of the joints, a gripper's force [N]: measured if possible, otherwise commanded
+        ("wrench", _f, (6,)),  # [N, N m] that the surroundings put on the tool; 0 where it is not estimated
         ("pressed", _f),  # [N] that forbids to activate it
     ],
 )
@@ -166,6 +167,7 @@ LIMITS = record(
         ("half_radius", _f),  # [m/rad] forward speed of both wheels' speeds
         ("turn", _f),  # [rad/rad] yaw rate of the difference of their speeds
         ("largest_error", _f),  # [rad/s] of a wheel's speed with which its servo gives its largest torque
+        ("servo_gain", _f),  # [N m s/rad]
         ("counts", _f),  # [1/rad] of the encoders
         ("per_count", _f),  # [m] forward for a count of each wheel
         ("yaw_per_count", _f),
@@ -262,7 +264,6 @@ ARM = record(
         ("presses", _b),  # more than it may
         ("is_measured", _b),
         ("is_lost", _b),
-        ("wrench", _f, (6,)),
         # Room for dynamics.
         ("turns", _f, (JOINTS, 3, 3)),
         ("spin", _f, (JOINTS, 3)),
@@ -321,7 +322,6 @@ ARM_LIMITS = record(
         # Forces.
         ("feels", _b),
         ("has_wrench", _b),
-        ("has_effort", _b),
         ("most_force", _f),
         ("felt_ticks", _i),
         ("felt_hz", _f),
@@ -384,7 +384,6 @@ SPRING = record(
         ("swung", _f, (JOINTS + 6,)),  # last directions of joints and equilibrium
         ("swings", *_vector),  # how often the joints' turned
         # What the surroundings put on it: see `wrench`.
-        ("contact", _f, (6,)),  # [N, N m]
         ("torque", *_vector),  # [N m]
         ("expected", *_vector),
         ("rate", *_vector),

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.arm.equilibrium import is_spring_at_rest
-from bhd_lerobot.control.arm.spring import move_spring, tell_spring
-from bhd_lerobot.control.arm.step import Stage, has_to_be_told, is_arm_at_rest, move_arm
-from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest, tell_drive
+from bhd_lerobot.control.arm.spring import move_spring, report_spring, tell_spring
+from bhd_lerobot.control.arm.step import Stage, has_to_be_told, is_arm_at_rest, move_arm, report_arm
+from bhd_lerobot.control.drive import drive, drive_back, is_base_at_rest, report_drive, tell_drive
 from bhd_lerobot.control.fifo import drop, find_next, keep_newest
 from bhd_lerobot.control.guard import guard
 from bhd_lerobot.control.kernels import kernel
@@ -114,7 +114,19 @@ def tick(  # noqa: PLR0912, PLR0917
         move_spring(state, spring, arm_limits)
         end_tick(state, limits)
         tell_spring(state, spring, arm_limits)
+    report(state, monitor, arm, spring, limits, arm_limits)
     return True
+
+
+@kernel()
+def report(state: Any, monitor: Any, arm: Any, spring: Any, limits: Any, arm_limits: Any) -> None:  # noqa: PLR0917
+    """Write what is known of a robot beside what its ticks go by, for whoever reads the record."""
+    if arm is not None:
+        report_arm(state, arm, arm_limits)
+    if spring is not None:
+        report_spring(state, spring, arm_limits)
+    if monitor is not None:
+        report_drive(state, limits)
 
 
 @kernel()

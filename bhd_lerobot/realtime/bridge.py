@@ -119,7 +119,7 @@ class LiveBridge(Bridge):
     def reported(self, row: Any) -> CerebellumState:
         """Return the state that was published."""
         self.show(row)
-        return self.cerebellum.reported(self.cerebellum.now_ns)
+        return self.cerebellum.state(self.cerebellum.now_ns)
 
     def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
         """Request a change of mode, and wait until it is published.

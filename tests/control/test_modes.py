@@ -311,8 +311,8 @@ def test_a_robot_that_presses_is_neither_reset_nor_activated_and_the_force_is_pu
     rig.tick(100)
     if request_ == Request.ACTIVATE:
         assert rig.request(Request.RESET).accepted.all()
-    before, force = rig.mode, np.array([80.0, 0.0])
-    rig.cerebellum.controller.pressed = lambda: force  # type: ignore[method-assign]
+    before, force = rig.mode, rig.cerebellum.states["pressed"]
+    force[0] = 80.0
     assert rig.request(request_).reasons.tolist() == [Reason.PRESSED, Reason.ACCEPTED]
     assert rig.mode == before
     assert rig.cerebellum.estop.pressed[0] or request_ == Request.ACTIVATE  # nothing was acknowledged

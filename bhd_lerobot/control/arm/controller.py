@@ -32,7 +32,6 @@ _SLOW = 0.2  # [rad/s] the joints' speed below which they are held where they ar
 _BACK, _BACK_TOOL = 0.5, 0.25  # [rad/s, m/s] of joints and tool that a stop brings back, unless they were faster
 _SETTLED_S = 0.04  # [s] what was stopped may swing back once
 _YIELD_S = 0.2  # [s] for which joints that do not come to rest are waited for where they were: something pushes them
-_PRESSED_N = 30.0  # [N] an arm that presses more is neither reset nor activated
 _GIVES = 0.5  # the least share of its largest torque that the servo of a blocked joint gives
 _ARRIVED_RAD = 2e-4  # [rad]
 _TINY = 1e-9
@@ -110,7 +109,6 @@ class ArmController(Controller):
         self.acceleration: Array = arms["change"][:, :width]
         self.busy, self.protective_stop, self.limits = (states[k] for k in ("busy", "protective_stop", "limits"))
         self.force: NDArray[np.float64] = arms["force"]
-        self.contact_wrench = arms["wrench"][:, : 6 if wrench else 0]
         self.goals = GoalManager(body, states, arms, control_hz, planning)
         self._hz, self._forward = control_hz, ForwardKinematics(arm.chain)
         self._most_yield_ticks = round(_YIELD_S * control_hz)
@@ -218,7 +216,7 @@ class ArmController(Controller):
             state["is_distrusted"] = False
             self._blind[sim] = True
             if self._limits["feels"] and not self.arms["wrong"][sim, : self._dof].all():
-                forget_force(self.arms[sim])
+                forget_force(state, self.arms[sim])
         if state["has_setpoint"]:
             state["has_setpoint"] = False
             self._set_setpoint(sim)
@@ -291,7 +289,7 @@ class ArmController(Controller):
             wrong = (self._misread_joints(sim) | self._blind[sim]) & (settled & measured) & (arm["wrong"][:dof] == 0)
             if wrong.any():
                 arm["wrong"][:dof] |= wrong
-                forget_force(arm)  # what was felt was felt in another posture
+                forget_force(self.states[sim], arm)  # what was felt was felt in another posture
             torque, pressing, doubtful = arm["torque"][:dof], float(arm["pressing"]), bool(arm["wrong"].any())
             sensed = Sensed(
                 self._where(sim)[None], torque[None], *(np.array([v]) for v in (pressing, measured, doubtful))
@@ -321,7 +319,7 @@ class ArmController(Controller):
             message = _DEAF if (moved < _STANDS).all() else message
             self._protect(sim, Watchdog.BLOCKED, message, follows=is_misread or not measured)
         # One that gives way does what it can.
-        is_new = arm["ticks"] == 0 and self._limits["has_effort"]
+        is_new = arm["ticks"] == 0 and self.states["has_effort"][sim]
         is_free = not arm["yields"] and (not arm["is_stopped"] or self.goals.following[sim])
         if arm["presses"] and is_new and is_free:
             if self._misread_joints(sim).any():  # it is the force in another posture
@@ -346,7 +344,7 @@ class ArmController(Controller):
 
     def _is_measured(self, sim: int) -> bool:
         """Return whether the efforts of an arm are measurements."""
-        has_effort = bool(self._limits["has_effort"])
+        has_effort = bool(self.states["has_effort"][sim])
         return has_effort and (not self._limits["feels"] or bool(self.arms["is_measured"][sim]))
 
     def _protect(self, sim: int, cause: Watchdog, message: str, *, follows: bool) -> None:
@@ -410,10 +408,6 @@ class ArmController(Controller):
         pairs = zip(self._state_of, self._arm_of, strict=True)
         return np.array([is_arm_at_rest(state, arm, self._limits_of) for state, arm in pairs])
 
-    def pressed(self) -> Array:
-        """Return the forces on the tools [N] that are above 30 N, shape (n,), see `Controller.pressed`."""
-        return np.where(self.force > _PRESSED_N, self.force, 0.0)
-
     def configure(self, ids: NDArray[np.intp], reading: PlantReading) -> None:
         """Start from the posture that the arms are in."""
         self.command[ids] = np.minimum(np.maximum(reading.position[ids], self._lower), self._upper)
@@ -442,13 +436,6 @@ class ArmController(Controller):
     def cause(self) -> str:
         """Why the last stop of its own was, as text."""
         return self._cause
-
-    def efforts(self, reading: PlantReading) -> Array:
-        """Return the torques that the servos give beyond gravity [N m], the gripper's force last [N]."""
-        effort = np.subtract(self.actuators, reading.position)
-        effort *= self._stiffness
-        effort -= reading.velocity * self._damping
-        return np.minimum(np.maximum(effort, -self._effort), self._effort)
 
     # --- goals -------------------------------------------------------------------------------------------------------
 

@@ -80,12 +80,13 @@ def explain_force(body: Body, arm: Any, limits: Any) -> str:
     )
 
 
-def forget_force(arm: Any) -> None:
+def forget_force(state: Any, arm: Any) -> None:
     """Forget what an arm felt: it was somewhere else."""
     for name in ("hung", "zeros", "force", "pressing", "presses"):
         arm[name] = 0
-    for name in ("sum", "torque", "wrench"):
+    for name in ("sum", "torque"):
         arm[name][:] = 0.0
+    state["wrench"][:] = 0.0
     arm["is_fresh"] = True
 
 
@@ -94,10 +95,10 @@ def feel(state: Any, arm: Any, limits: Any, geometry: Any) -> bool:
     """Take one tick into account; return whether there is a new estimate that is too large.
 
     To the arm's `force` [N], 0 where the joints feel too little to ask, `torque`, what the motors give more than the
-    posture and its motion need [N m], `pressing`, the force that is more than a load which need not be declared [N],
-    and `wrench`, what the surroundings put on the tool, in the base frame, if it is asked for [N, N m].
+    posture and its motion need [N m], and `pressing`, the force that is more than a load which need not be declared
+    [N]; to the robot's `wrench` what the surroundings put on the tool, in the base frame, if it is asked for [N, N m].
     """
-    if not limits.has_effort:
+    if not state.has_effort:
         arm.is_measured = False
         return False
     is_none = True
@@ -116,7 +117,7 @@ def feel(state: Any, arm: Any, limits: Any, geometry: Any) -> bool:
         find_jacobian(arm, geometry, arm.felt_position)
         find_wrench(arm, limits)
         for k in range(6):
-            arm.wrench[k] = -arm.side[k]
+            state.wrench[k] = -arm.side[k]
     find_force(arm, limits, geometry)
     return arm.presses
 

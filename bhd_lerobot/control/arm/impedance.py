@@ -10,8 +10,6 @@ from bhd_lerobot.control.arm.spring import publish_equilibrium, tell_spring
 from bhd_lerobot.control.arm.wrench import OBSERVER_GAIN
 from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
-from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
-from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.geometry.rigid_bodies import find_dynamics
 from bhd_lerobot.control.kernels import as_objects, clamp
 from bhd_lerobot.control.plant import PlantReading
@@ -24,7 +22,6 @@ WIDTH = 8
 _MOST_TOOL_SPEED, _MOST_JOINT_SPEED = 2.0, 1.1  # shares of the equilibrium's largest and of their own: beyond, a stop
 _MOST_EFFORT = 0.8  # share of a joint's largest torque that the surroundings may put on it
 _MOST_SWINGS = 2.0
-_LIGHT_N = 20.0  # [N] what presses less is no obstacle to an activation
 _SET = ("wanted_stiffness", "ratio", "is_fixed", "fixed_damping", "largest")
 
 
@@ -71,7 +68,7 @@ class ImpedanceController(Controller):
             raise ConfigError(f"control_hz is {control_hz}; impedance needs at least {OBSERVER_GAIN:g} ticks a second.")
         if not (max_force > 0.0 and frame_ticks > 0):
             raise ConfigError(f"max_force is {max_force} and frame_ticks is {frame_ticks}; both must be above 0.")
-        self.arm, self._forward = arm, ForwardKinematics(arm.chain)
+        self.arm = arm
         self.joints, self._dof = len(arm.limits.names), len(arm.chain.joints)
         self.numbers["arm_values"] = WIDTH
         self.springs, self.arm_limits = new_springs(n), np.zeros(1, ARM_LIMITS)
@@ -81,7 +78,6 @@ class ImpedanceController(Controller):
         self.actuators: Array = states["actuators"][:, : self.joints]
         self.busy, self.protective_stop, self.limits = (states[k] for k in ("busy", "protective_stop", "limits"))
         self.wrench: Array = springs["wrench"]
-        self.contact_wrench: Array = springs["contact"]
         # As the functions of a tick take them.
         self._state_of, self._spring_of = as_objects(states), as_objects(springs)
         [self._limits_of] = as_objects(self.arm_limits)
@@ -97,6 +93,8 @@ class ImpedanceController(Controller):
             put(row, name, getattr(limits, field))
         for name in ("lower", "upper", "effort"):
             put(row, name, getattr(limits, name))
+        put(row, "stiffness", arm.servo_stiffness)  # of the gripper's servo, which is the last
+        put(row, "damping", arm.servo_damping)
         # Positions beyond what the arm can ever reach are refused; nearer ones are for the spring to find out.
         row["most_reach"] = arm.chain.reach
         put(row, "most_speed", _MOST_JOINT_SPEED * np.asarray(limits.velocity[:dof]))
@@ -186,22 +184,3 @@ class ImpedanceController(Controller):
             state.actuators[k] = clamp(spring.gravity[k], -limits.effort[k], limits.effort[k])
         state.actuators[dof] = opening
         publish_equilibrium(state, spring)
-
-    def pressed(self) -> Array:
-        """Return the force between each tool and its surroundings [N], shape (n,); 0 if it is small."""
-        force, springs = np.linalg.norm(self.contact_wrench[:, :3], axis=1), self.springs
-        return np.where(springs["is_braked"] & springs["is_still"] & (force > _LIGHT_N), force, 0.0)
-
-    # --- reports -----------------------------------------------------------------------------------------------------
-
-    def efforts(self, reading: PlantReading) -> Array:
-        """Return the torques of the motors, weight included [N m], and the commanded force of the gripper [N]."""
-        efforts: Array = self.states["written"][:, : self.joints].copy()
-        stiffness, damping = self.arm.servo_stiffness[-1], self.arm.servo_damping[-1]
-        efforts[:, -1] = (efforts[:, -1] - reading.position[:, -1]) * stiffness - reading.velocity[:, -1] * damping
-        return efforts
-
-    def measured(self, reading: PlantReading) -> Array:
-        """Return the tool's pose and the opening as they are, shape (n, 8)."""
-        position = reading.position
-        return np.concatenate([pose_vectors(self._forward.tool(position[:, :-1])), position[:, -1:]], axis=1)

@@ -37,7 +37,6 @@ class MobileArmController(Controller):
         self.width, self.joints = arm.width + drive.width, arm.joints + drive.joints
         self.command, self.actuators = (states[name][:, : self.width] for name in ("command", "actuators"))
         self.busy, self.protective_stop, self.limits = (states[k] for k in ("busy", "protective_stop", "limits"))
-        self.contact_wrench = arm.contact_wrench
         self._state_of, [self._numbers] = as_objects(states), as_objects(self.numbers)
 
     def _parts(self, reading: PlantReading) -> tuple[PlantReading, PlantReading]:
@@ -87,23 +86,9 @@ class MobileArmController(Controller):
         """Why the last stop of its own was, as text."""
         return self.drive.cause or self.arm.cause
 
-    def pressed(self) -> Array:
-        """Return the forces on the tools that forbid to activate the robots [N], shape (n,)."""
-        return self.arm.pressed()
-
-    def efforts(self, reading: PlantReading) -> Array:
-        """Return the efforts of the arms' servos and of the wheels' [N m, N], shape (n, joints)."""
-        arm, wheels = self._parts(reading)
-        return np.concatenate([self.arm.efforts(arm), self.drive.efforts(wheels)], axis=1)
-
     def odometry(self) -> Array:
         """Return x [m], y [m] and yaw [rad] since the start, shape (n, 3)."""
         return self.drive.odometry()
-
-    def measured(self, reading: PlantReading) -> Array:
-        """Return where the robots really are in the space of the commands, shape (n, width)."""
-        arm, wheels = self._parts(reading)
-        return np.concatenate([self.arm.measured(arm), self.drive.measured(wheels)], axis=1)
 
     def submit(self, sim: int, command: BrainCommand, blocked: ResultCode | None = None) -> CommandResult | None:
         """Take a goal of the arm; None if it was accepted, otherwise the refusal."""

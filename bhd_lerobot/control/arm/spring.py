@@ -41,6 +41,7 @@ _GAINED = 0.8  # share of the tool's largest speed that it may gain while torque
 # equilibrium, is part of a loop that swings: its readings are late.
 _SWING_SPEED, _SWING_S = 0.15, 0.4
 _ROOM_RAD = 0.1  # so far from where a brake closed does the torque that carries the arm's weight follow the readings
+_LIGHT_N = 20.0  # [N] what presses less is no obstacle to an activation
 _TINY = 1e-12
 _HOLD, _STOPPING = int(Mode.HOLD), int(Mode.STOPPING)
 _ENTERED = tuple(int(one) for one in (Mode.STOPPING, Mode.INACTIVE, Mode.HOLD, Mode.SAFE_OFF, Mode.ESTOP, Mode.FAULT))
@@ -107,7 +108,7 @@ def move_spring(state: Any, spring: Any, limits: Any) -> None:
         spring.tool_speed[i] = 0.0
         for k in range(dof):
             spring.tool_speed[i] += spring.jacobian[i, k] * speed[k]
-    state.protective_stop = _GUARD if spring.is_refused else supervise_spring(spring, limits, speed)
+    state.protective_stop = _GUARD if spring.is_refused else supervise_spring(state, spring, limits)
     spring.is_refused = False
     change_stiffness(spring, limits)
     move_equilibrium(state, spring, limits)
@@ -134,26 +135,47 @@ def move_spring(state: Any, spring: Any, limits: Any) -> None:
 
 @kernel()
 def publish_equilibrium(state: Any, spring: Any) -> None:
-    """Write what is applied: of a quaternion and its negative the one on the side of the tool that points down."""
-    side = spring.turn[1]
-    for k in range(4):
-        if side == 0.0:
-            side = spring.turn[k]
-    sign = -1.0 if side < 0.0 else 1.0
-    for k in range(3):
-        state.command[k] = spring.place[k]
-    for k in range(4):
-        state.command[3 + k] = sign * spring.turn[k]
+    """Write what is applied."""
+    put_pose(state.command, spring.place, spring.turn)
     state.command[7] = spring.opening
 
 
 @kernel()
-def supervise_spring(spring: Any, limits: Any, speed: Array) -> int:
-    """Return why an arm is to stop, as a `Watchdog` flag: it is too fast, or in too hard a contact; 0 if it is not."""
+def put_pose(values: Array, place: Array, turn: Array) -> None:
+    """Write a position and a quaternion, as the one of both signs that is on the side of the tool that points down."""
+    side = turn[1]
+    for k in range(4):
+        if side == 0.0:
+            side = turn[k]
+    sign = -1.0 if side < 0.0 else 1.0
+    for k in range(3):
+        values[k] = place[k]
+    for k in range(4):
+        values[3 + k] = sign * turn[k]
+
+
+@kernel()
+def report_spring(state: Any, spring: Any, limits: Any) -> None:
+    """Write where the tool was read, the torques of the motors, and with what it presses, to the record."""
     dof = limits.dof
+    put_pose(state.measured, spring.tool, spring.tool_turn)
+    state.measured[7] = state.position[dof]
+    for k in range(dof + 1):
+        state.torque[k] = state.effort[k] if state.has_effort else state.written[k]
+    if not state.has_effort:
+        servo = limits.stiffness[dof] * (state.written[dof] - state.position[dof])
+        state.torque[dof] = servo - limits.damping[dof] * state.velocity[dof]
+    force = length(state.wrench, 0)
+    state.pressed = force if spring.is_still and force > _LIGHT_N else 0.0
+
+
+@kernel()
+def supervise_spring(state: Any, spring: Any, limits: Any) -> int:
+    """Return why an arm is to stop, as a `Watchdog` flag: it is too fast, or in too hard a contact; 0 if it is not."""
+    dof, speed = limits.dof, state.velocity
     is_fast = length(spring.tool_speed, 0) > limits.most_tool_speed[0]
     is_fast = is_fast or length(spring.tool_speed, 3) > limits.most_tool_speed[1]
-    is_hard = length(spring.contact, 0) > limits.most_force
+    is_hard = length(state.wrench, 0) > limits.most_force
     decay = 1.0 / (_SWING_S * limits.hz)
     for k in range(6):
         decay += note_direction(spring, dof + k, spring.speed[k])

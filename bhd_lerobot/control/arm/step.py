@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.control.arm.force_limit import feel
 from bhd_lerobot.control.arm.held import follow_gripper
 from bhd_lerobot.control.arm.setpoints import follow_setpoint, leave_setpoints, take_setpoint
-from bhd_lerobot.control.kernels import kernel
+from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.control.messages import Limit
 from bhd_lerobot.control.motion.player import play
 from bhd_lerobot.control.motion.supervision import has_goals_to_serve, most_away
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 SURE = 8.0  # times its largest torque that a servo would have to give: 0.03 rad of a joint at rest
 REST = 1e-6  # [rad/s, m/s] a reference slower than this is at rest
+_PRESSED_N = 30.0  # [N] an arm that presses more is neither reset nor activated
 _EFFORT = int(Limit.EFFORT)
 
 
@@ -164,3 +165,17 @@ def lead_servos(state: Any, arm: Any, limits: Any) -> None:
             is_off = is_off or abs(state.command[k] - state.position[k]) > most_away(arm, limits, k)
     arm.off_ticks = arm.off_ticks + 1 if is_off and not arm.is_stopped else 0
     arm.is_blocked = arm.off_ticks >= limits.blocked_ticks
+
+
+@kernel()
+def report_arm(state: Any, arm: Any, limits: Any) -> None:
+    """Write where the joints were read, the torques of their servos, and with what the arm presses, to the record."""
+    for k in range(limits.width):
+        state.measured[k] = state.position[k]
+        torque = state.effort[k]
+        if not state.has_effort:  # what the servos give beyond gravity
+            off = state.actuators[k] - state.position[k]
+            torque = limits.stiffness[k] * off - limits.damping[k] * state.velocity[k]
+            torque = clamp(torque, -limits.effort[k], limits.effort[k])
+        state.torque[k] = torque
+    state.pressed = arm.force if arm.force > _PRESSED_N else 0.0

@@ -20,11 +20,11 @@ _DAMPING = 0.01
 def observe_contact(state: Any, spring: Any, limits: Any) -> None:
     """Take one tick into account, whose dynamics the record has.
 
-    To the spring's `torque`, what the surroundings put on the joints [N m], and `contact`, the force [N] and the moment
-    [N m] about the tool centre point that cause it if they act on the tool, in the base frame; near zero in directions
-    that a singular posture can feel nothing from.
+    To the spring's `torque`, what the surroundings put on the joints [N m], and the robot's `wrench`, the force [N] and
+    the moment [N m] about the tool centre point that cause it if they act on the tool, in the base frame; near zero in
+    directions that a singular posture can feel nothing from.
     """
-    by_sensors = spring.is_braked and limits.has_effort  # what a brake gives is known to them alone
+    by_sensors = spring.is_braked and state.has_effort  # what a brake gives is known to them alone
     for k in range(limits.dof):
         rate = spring.gradient[k] - spring.gravity[k]
         applied = state.effort[k] if by_sensors else state.written[k]
@@ -39,11 +39,11 @@ def observe_contact(state: Any, spring: Any, limits: Any) -> None:
         spring.expected[k] += torque / limits.hz
     spring.is_fresh = False
     for i in range(6):
-        spring.contact[i] = 0.0
+        state.wrench[i] = 0.0
         for k in range(limits.dof):
-            spring.contact[i] += spring.jacobian[i, k] * spring.torque[k]
+            state.wrench[i] += spring.jacobian[i, k] * spring.torque[k]
         for j in range(6):
             spring.square[i, j] = _DAMPING * _DAMPING if i == j else 0.0
             for k in range(limits.dof):
                 spring.square[i, j] += spring.jacobian[i, k] * spring.jacobian[j, k]
-    solve(spring.square, spring.contact, 6)
+    solve(spring.square, state.wrench, 6)

@@ -68,7 +68,10 @@ class Host:
         self.body = body = body if config.jerk_limits else without_jerk_limits(body)
         self.parts: list[Part] = self._make_parts(planning)
         sensors = sum(part.sensors for part in self.parts)
-        self.cerebellum = Cerebellum(body, plant, config.control_hz, _one(self.parts), sensors=sensors)
+        is_framed = self.world is not None
+        self.cerebellum = Cerebellum(
+            body, plant, config.control_hz, _one(self.parts), sensors=sensors, is_framed=is_framed
+        )
         self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance, self.run_ticks)
         self.action_names = tuple(name for part in self.parts for name in part.action_names)
         self.observation_names = tuple(name for part in self.parts for name in part.observation_names)
@@ -78,7 +81,14 @@ class Host:
         self.sensor_period_s = max(part.sensor_period_s for part in self.parts)
         for part in self.parts:
             part.host = self
-        self._actions, self._commands = _columns(self.parts)
+        self._observed, self._actions, self._commands = (
+            _places(widths)
+            for widths in (
+                [len(part.observation_names) for part in self.parts],
+                [len(part.action_names) for part in self.parts],
+                [part.controller.width for part in self.parts],
+            )
+        )
         self.running = np.ones(n, np.bool_)
         self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
@@ -130,13 +140,18 @@ class Host:
         """Return the newest reading of the joints."""
         return self.cerebellum.reading
 
-    def sense(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,)."""
+    def sense(self, out: NDArray[np.float64] | None = None) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,).
+
+        Args:
+            out: where the floats are written; a new array if None.
+        """
+        out = np.empty((self.n, len(self.observation_names))) if out is None else out
         reading = self.read()
-        if len(self.parts) == 1:
-            return self.parts[0].sense(reading), self.parts[0].oldest()
-        floats = np.concatenate([part.sense(reading) for part in self.parts], axis=1)
-        return floats, np.minimum.reduce([part.oldest() for part in self.parts])
+        for part, columns in zip(self.parts, self._observed, strict=True):
+            part.sense(reading, out[:, columns])
+        oldest = [part.oldest() for part in self.parts]
+        return out, oldest[0] if len(oldest) == 1 else np.minimum.reduce(oldest)
 
     def truth(self) -> Any:
         """Return what a task judges by, as far as it is known; touches since the start of the last frame."""
@@ -308,7 +323,7 @@ class Host:
         applied = self.to_action(cerebellum.command)
         columns = {
             keys.COMMAND_AGE: cerebellum.command_age_ns(self.bridge.now_ns) / NANOSECONDS,
-            keys.EFFORT: cerebellum.efforts(),
+            keys.EFFORT: cerebellum.efforts.copy(),
         }
         if self.config_wrench:
             columns[keys.WRENCH] = cerebellum.controller.contact_wrench.copy()
@@ -448,11 +463,9 @@ def _one(parts: Sequence[Part]) -> Controller:
     return MobileArmController(arm, drive)  # type: ignore[arg-type]
 
 
-def _columns(parts: Sequence[Part]) -> tuple[list[slice], list[slice]]:
-    """Return where the parts' values are in an action and in a command."""
-    widths = [len(part.action_names) for part in parts], [part.controller.width for part in parts]
-    actions, commands = ([slice(sum(w[:k]), sum(w[: k + 1])) for k in range(len(w))] for w in widths)
-    return actions, commands
+def _places(widths: Sequence[int]) -> list[slice]:
+    """Return where values of these widths are, one after the other."""
+    return [slice(sum(widths[:k]), sum(widths[: k + 1])) for k in range(len(widths))]
 
 
 LEFT_OUT_IF_OFF = ("plant", "jerk_limits", "payload", "wrench", "obstacles", "collision_monitor", "servos")

@@ -115,9 +115,8 @@ class StatePublisher:
         if is_faulty != self._was_faulty or (is_faulty and is_new):
             self._was_faulty = is_faulty
             self._record["problem"] = self._problem().encode()[:_PROBLEM_BYTES] if is_faulty else b""
-        cerebellum.report()
         self._state[:] = self._source
-        self._observation[:], oldest = host.sense()
+        _, oldest = host.sense(self._observation)
         self._numbers[:] = (
             slot.index,
             self.segment,

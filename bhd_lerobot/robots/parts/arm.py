@@ -96,16 +96,15 @@ class ArmPart(Part):
         self._taken = np.zeros((plant.n, 3))  # where the tool was to be by the last action that was not refused [m]
         self._refused = np.zeros(plant.n, np.bool_)  # the last action
 
-    def sense(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return its observation's floats, shape (n, features)."""
-        values = self._values
-        return self._observed(np.concatenate([reading.position[:, :values], reading.velocity[:, :values]], axis=1))
+    def sense(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        """Write its observation's floats, shape (n, features): with the tool's pose if asked for."""
+        self._sense_joints(reading, out)
+        if self.config.tool_pose:
+            out[:, 2 * self._values :] = pose_vectors(self.kinematics.tool(out[:, : self._joints]))
 
-    def _observed(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return observations of positions and speeds, shape (n, 2 joints): with the tool's pose if asked for."""
-        if not self.config.tool_pose:
-            return state
-        return np.concatenate([state, pose_vectors(self.kinematics.tool(state[:, : self._joints]))], axis=1)
+    def _sense_joints(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        values = self._values
+        out[:, :values], out[:, values : 2 * values] = reading.position[:, :values], reading.velocity[:, :values]
 
     def truth(self, reading: PlantReading) -> dict[str, Any]:
         """Return what the joints say: where the tools are. Of objects and touches nothing is known."""

@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.body import Body, Drive, LidarSpec
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.collision_monitor import new_monitors
 from bhd_lerobot.control.controller import Controller
-from bhd_lerobot.control.drive import BaseController
+from bhd_lerobot.control.drive import BaseController, twist_from_wheels
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.robots.parts.names import GYRO_NAMES, ODOMETRY_NAMES, TWIST_NAMES, drive_observation_names
@@ -58,16 +58,15 @@ class DrivePart(Part):
         beams = self.config.beams
         return reading.sensors[:, :beams], reading.sensors[:, beams:]
 
-    def sense(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return its observation's floats, shape (n, features)."""
-        wheels = reading.of_joints(self.first, 2) if self.first else reading
+    def sense(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        """Write its observation's floats, shape (n, features)."""
+        wheels, end = slice(self.first, self.first + 2), 2 + self.config.beams
         scan, rates = self._scan_and_rates(reading)
-        parts = [self.controller.measured(wheels), scan]
+        out[:, :2], out[:, 2:end] = twist_from_wheels(self.controller.drive, reading.velocity[:, wheels]), scan
         if self.config.odometry:
-            parts.append(self.controller.odometry_at(wheels.position))
+            out[:, end : (end := end + 3)] = self.controller.odometry_at(reading.position[:, wheels])
         if self.config.imu:
-            parts.append(rates)
-        return np.concatenate(parts, axis=1)
+            out[:, end:] = rates
 
     def oldest(self) -> NDArray[np.int64]:
         """Return the tick of its oldest reading, shape (n,)."""

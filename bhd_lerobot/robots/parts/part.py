@@ -43,8 +43,8 @@ class Part(ABC):
     first = 0
 
     @abstractmethod
-    def sense(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return its observation's floats, shape (n, features); `reading` is the robot's."""
+    def sense(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        """Write its observation's floats, shape (n, features); `reading` is the robot's."""
 
     def oldest(self) -> NDArray[np.int64]:
         """Return the tick of its oldest reading, shape (n,)."""

@@ -69,17 +69,14 @@ class SimulatedArm(ArmPart, SimulatedPart):
             "fingers_on_object": np.array(self.table.finger_on_object),
         }
 
-    def sense(self, reading: PlantReading) -> NDArray[np.float64]:
-        """Return its observation's floats, shape (n, features)."""
-        values = self._values
-        state = np.concatenate([reading.position[:, :values], reading.velocity[:, :values]], axis=1)
+    def _sense_joints(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        super()._sense_joints(reading, out)
         if np.count_nonzero(self._noise):
-            joints = self._joints
+            joints, speeds = self._joints, slice(self._values, self._values + self._joints)
             for sim in np.flatnonzero((self._noise > 0) & self.host.running):
                 noise = self.host.rngs[sim].normal(0.0, self._noise[sim], (2, joints))
-                state[sim, :joints] += noise[0]
-                state[sim, values : values + joints] += noise[1] * _SPEED_NOISE
-        return self._observed(state)
+                out[sim, :joints] += noise[0]
+                out[sim, speeds] += noise[1] * _SPEED_NOISE
 
     def after_step(self) -> None:
         """Note touches."""

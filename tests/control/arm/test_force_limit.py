@@ -27,8 +27,8 @@ class Felt:
         position[:] = postures
         terms = DYNAMICS.terms(position, velocity)
         effort[:] = terms.gravity + np.einsum("nij,ni->nj", terms.jacobian[:, :3], forces)
-        self.arms, self.limits = controller.arms, controller.arm_limits[0]
-        self.limits["has_effort"] = True
+        self.arms, self.limits, self.states = controller.arms, controller.arm_limits[0], controller.states
+        controller.states["has_effort"] = True
         [geometry, *_], [limits] = as_objects(controller.geometries), as_objects(controller.arm_limits)
         pairs = zip(as_objects(controller.states), as_objects(self.arms), strict=True)
         self._records = [(state, arm, limits, geometry) for state, arm in pairs]
@@ -52,7 +52,7 @@ def test_forces_are_estimated_and_compared_with_the_largest() -> None:
     np.testing.assert_allclose(felt.arms["force"], np.linalg.norm(forces, axis=1), rtol=0.12)
     assert felt.arms["presses"].tolist() == [False, False, True, True]
     assert "150 N is the most" in explain_force(ARM, felt.arms[2], felt.limits)
-    forget_force(felt.arms[2])
+    forget_force(felt.states[2], felt.arms[2])
     assert felt.arms["force"][2] == 0.0
     assert not felt.arms["presses"][2]
 
@@ -77,7 +77,7 @@ def test_forces_in_random_postures_and_directions_are_found_as_the_page_says(see
 
 def test_a_plant_that_measures_no_efforts_has_no_limit() -> None:
     felt = Felt(np.array([(0.0, 0.0, -500.0)]))
-    felt.limits["has_effort"] = False
+    felt.states["has_effort"] = False
     assert felt.update(100) == -1
 
 

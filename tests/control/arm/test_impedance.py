@@ -163,7 +163,7 @@ def test_an_invalid_quaternion_stops_the_arm(value: float) -> None:
     assert rig.mode == Mode.FAULT
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written).all()
-    np.testing.assert_allclose(rig.controller.command[0, :3], rig.controller.measured(rig.cerebellum.reading)[0, :3])
+    np.testing.assert_allclose(rig.controller.command[0, :3], rig.cerebellum.state(rig.now).measured[0, :3])
 
 
 def test_places_beyond_any_reach_are_clipped() -> None:
@@ -223,7 +223,7 @@ def test_a_broken_encoder_is_a_fault_and_does_not_spread() -> None:
 @pytest.mark.parametrize("cause", [Mode.ESTOP, Mode.FAULT], ids=lambda mode: mode.name)
 def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(cause: Mode) -> None:
     rig = StuckRig()
-    measured = rig.controller.measured(rig.cerebellum.reading)
+    measured = rig.cerebellum.state(rig.now).measured
     rig.target[0, 2] += 0.1
     rig.send(50)  # the plant is stuck: the equilibrium is 0.1 m away from the tool
     commanded = rig.controller.command.copy()
@@ -273,7 +273,7 @@ def test_a_restart_forgets_the_episode_before() -> None:
     rig.cerebellum.restart(np.array([0]))
     assert rig.controller.contact_wrench.tolist() == [[0] * 6]
     rig.tick(50)  # not configured: it stays where it is
-    np.testing.assert_allclose(rig.controller.command, rig.controller.measured(rig.cerebellum.reading), atol=1e-9)
+    np.testing.assert_allclose(rig.controller.command, rig.cerebellum.state(rig.now).measured, atol=1e-9)
     assert not rig.controller.wrench.any()
 
 
