@@ -15,6 +15,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lerobot.teleoperators.config import TeleoperatorConfig
 
 import bhd_lerobot.plugin  # noqa: F401  registers the teleoperators
@@ -22,6 +23,7 @@ from bhd_lerobot.bodies.tabletop import OBJECT_FIELDS
 from bhd_lerobot.cli import ros2
 from bhd_lerobot.control.commands import GoalPhase, ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Watchdog
+from bhd_lerobot.control.record import STATE_FIELDS
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.schema import DEFAULT_FEATURES
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -74,6 +76,30 @@ _TELEOPERATORS = """\
 Besides these options each has LeRobot's own `teleop.id` and `teleop.calibration_dir`, which ours do not need.
 """
 
+_RECORD = """\
+# The record of a robot
+
+What a tick of the [cerebellum](../explanation/control.md) reads and changes is one record for each robot, a numpy
+structured type, `bhd_lerobot.control.record.STATE`: a row of `Cerebellum.states`, and on the wall clock of the ring
+that its process publishes every tick. Values beyond a robot's own joints are 0. An arm on a base has the arm's values
+first, then the wheels'. A command of a base is a forward speed [m/s] and a yaw rate [rad/s], one of an arm joint
+positions [rad] and an opening [m], one of an impedance the pose of the tool and an opening.
+"""
+# In which columns of a dataset fields are recorded, at the end of each frame.
+_RECORDED = {
+    "command": f"`{keys.APPLIED_ACTION}`",
+    "requested": f"`{keys.ACTION}` of a chunk",
+    "torque": f"`{keys.EFFORT}`",
+    "wrench": f"`{keys.WRENCH}`",
+    "mode": f"`{keys.MODE}`",
+    "limits": f"`{keys.LIMITS}`",
+    "watchdog": f"`{keys.WATCHDOG}`",
+    "due_ns": f"`{keys.COMMAND_AGE}`",
+    "position": f"`{keys.OBSERVATION_STATE}`",
+    "velocity": f"`{keys.OBSERVATION_STATE}`",
+    "odometry": f"`{keys.OBSERVATION_STATE}`",
+}
+
 # Groups of classes whose options are listed already: what they are options of, and the page and anchor.
 _MANY = 15  # options that are not listed twice
 Listed = dict[frozenset[type], tuple[str, str]]
@@ -121,7 +147,7 @@ def pages() -> dict[Path, str]:
         *("## `bhd-ros2 bridge`\n", *_options(BridgeConfig, "", "ros2.md", listed)),
         *("## `bhd-ros2 topics`, `record` and `play`\n", *_commands(ros2.network_parser())),
     ]
-    written = {FOLDER / "options.md": _index()}
+    written = {FOLDER / "options.md": _index(), FOLDER / "record.md": _record()}
     for name, parts in texts.items():
         page = "\n".join(parts)
         # A page of one command has no headings of the second level of its own.
@@ -170,6 +196,18 @@ def _index() -> str:
         "### Phases of a goal\n\nIn `Feedback.phase`.\n",
         _members(GoalPhase),
     ]
+    return "\n".join(parts)
+
+
+def _record() -> str:
+    """Return the page of a robot's record."""
+    parts = [_RECORD]
+    for title, fields in STATE_FIELDS.items():
+        rows = []
+        for name, (kind, shape, meaning) in fields.items():
+            size = " × ".join(map(str, shape)) or 1
+            rows.append((f"`{name}`", np.dtype(kind).name, size, meaning, _RECORDED.get(name, "")))
+        parts += [f"## {title}\n", _table(("field", "type", "size", "meaning", "recorded in"), rows)]
     return "\n".join(parts)
 
 

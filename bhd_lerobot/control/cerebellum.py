@@ -26,7 +26,7 @@ from bhd_lerobot.control.messages import (
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
-from bhd_lerobot.control.record import JOINTS, command_age_ns, new_states, put
+from bhd_lerobot.control.record import JOINTS, new_states, put
 from bhd_lerobot.control.tick import drop_all, judge_all, report, tick_arms, tick_bases, tick_mobile_arms, tick_springs
 from bhd_lerobot.errors import ConfigError
 
@@ -406,11 +406,6 @@ class Cerebellum:
         watchdog = self.states["watchdog"].copy()
         self.states["watchdog"] = 0
         return self.controller.take_limits(), watchdog
-
-    def command_age_ns(self, now_ns: int) -> NDArray[np.int64]:
-        """Return how long ago the command in force was due [ns], shape (n,); 0 for a robot that follows none."""
-        ages: NDArray[np.int64] = command_age_ns(self.states, now_ns)
-        return ages
 
     def state(self, now_ns: int) -> CerebellumState:
         """Return a copy of what the records report, whether they are this cerebellum's own or another's."""

@@ -30,90 +30,98 @@ NEVER = np.iinfo(np.int64).max
 
 _f, _i, _b, _vector = np.float64, np.int64, np.bool_, (np.float64, (JOINTS,))
 
-STATE = record(
-    "state",
-    [
-        # Readings, as far as they are measurements.
-        ("position", *_vector),  # [rad], a gripper's opening [m]
-        ("velocity", *_vector),  # [rad/s, m/s]
-        ("effort", *_vector),  # [N m, N]
-        ("has_effort", _b),  # they are measured
-        ("stamp_ns", _i),  # when the hardware measured them, on the clock of the ticks' origin
-        ("safety", np.int8),  # `SafetyStatus`
-        # What they are checked with: see `reading_check`.
-        ("near", *_vector),
-        ("last", *_vector),
-        ("read_ns", _i),
-        ("elapsed_ns", _i),
-        ("seen_position", *_vector),
-        ("seen_velocity", *_vector),
-        ("seen_ns", _i),
-        ("same_ticks", np.int64, (JOINTS,)),
-        ("same_effort", *_vector),
-        ("off", *_vector),
-        ("way", *_vector),
-        ("problem", _i),
-        ("problem_joint", _i),
-        ("problem_value", _f),
-        ("problem_ns", _i),
-        ("silence_ns", _i),  # age of the last reading that was refused for its age; 0 if none was
-        ("is_distrusted", _b),  # in this tick: positions are made up
-        # Modes.
-        ("mode", np.int8),  # `Mode`
-        ("mode_is_new", _b),  # the plant has not been told it
-        ("is_configured", _b),
-        ("is_deactivating", _b),
-        ("by_goal", _b),  # it moves because of a goal, not because of setpoints
-        ("watchdog", _i),  # `Watchdog` flags raised since they were last taken
-        ("limits", _i),  # `Limit` flags raised since they were last taken
-        ("refusals", np.int64, (len(Reason),)),
-        # Commands.
-        ("requested", *_vector),  # the setpoint that was taken last, before all limits
-        ("setpoints_taken", _i),
-        ("due_ns", _i),  # when it was due
-        ("taken_sequence", _i),
-        ("next_due_ns", _i),  # when the next in the queue is due; `NEVER` if none waits
-        ("next_entry", _i),
-        ("seen_head", _i),
-        # To the controller, for its next run: modes that were entered, as bits, and whether there is a new setpoint.
-        ("entered", _i),
-        ("has_setpoint", _b),
-        ("goes_back", _b),  # its reference is to be again what is written
-        # From the controller.
-        ("command", *_vector),  # what is applied, after all limits
-        ("actuators", *_vector),  # what it wants to write
-        ("busy", _b),
-        ("follows_goal", _b),
-        ("is_at_rest", _b),
-        ("protective_stop", _i),  # `Watchdog` flag of a stop of its own that has just begun
-        # The guard.
-        ("written", *_vector),  # what may be written
-        ("written_rate", *_vector),  # its last change, for each tick
-        # Wheels: twist, odometry, and how they turned since the last look.
-        ("target", _f, (2,)),
-        ("before", _f, (2,)),
-        ("rate", _f, (2,)),
-        ("brakes_hard", _b),
-        ("encoder", _f, (2,)),  # [counts]
-        ("odometry", _f, (3,)),  # x, y [m], yaw [rad]
-        ("ticks", _i),
-        ("look_at", np.int64, (3,)),  # tick of the next look, of the last one, and the reading's stamp then
-        ("looks", np.int64, (3,)),  # that found the two wheels and the gyroscope wrong, in a row
-        ("asked", _f, (2,)),  # [rad/s] times ticks that were commanded since the last look
-        ("turned", _f),  # [rad/s] times ticks that the gyroscope read since then
-        ("start", _f, (2,)),  # [rad] of the wheels then
-        ("first", _f, (2,)),  # [rad] when it was configured
-        ("stopped_for", _i),  # `Watchdog` flag of the last stop of its own
-        ("stood", _b),  # the wheels had not turned at all then
-        ("stopped_at", _f, (4,)),  # [rad/s] of the wheels then, commanded and read
-        ("late", _f, (2, LOOKS)),  # [rad/s] commanded between looks, the newest first
-        # Reports: nothing in here goes by them.
-        ("measured", *_vector),  # where it is in the space of the commands
-        ("torque", *_vector),  # [N m] of the joints, a gripper's force [N]: measured if possible, otherwise commanded
-        ("wrench", _f, (6,)),  # [N, N m] that the surroundings put on the tool; 0 where it is not estimated
-        ("pressed", _f),  # [N] that forbids to activate it
-    ],
-)
+STATE_FIELDS: dict[str, dict[str, tuple[Any, tuple[int, ...], str]]] = {
+    "Readings, as far as they are measurements": {
+        "position": (*_vector, "positions [rad], a gripper's opening [m]"),
+        "velocity": (*_vector, "speeds [rad/s, m/s]"),
+        "effort": (*_vector, "efforts [N m, N]"),
+        "has_effort": (_b, (), "whether they are measured"),
+        "stamp_ns": (_i, (), "when the hardware measured them, on the clock of the ticks' origin [ns]"),
+        "safety": (np.int8, (), "`SafetyStatus`"),
+    },
+    "What readings are checked with": {  # see `reading_check`
+        "near": (*_vector, "positions that joints can have got to [rad, m]"),
+        "last": (*_vector, "the last positions that were measurements [rad, m]"),
+        "read_ns": (_i, (), "stamp of the reading before [ns]"),
+        "elapsed_ns": (_i, (), "time between the two [ns]"),
+        "seen_position": (*_vector, "of torque motors, positions in the tick before [rad, m]"),
+        "seen_velocity": (*_vector, "speeds in the tick before [rad/s, m/s]"),
+        "seen_ns": (_i, (), "their stamp [ns]"),
+        "same_ticks": (np.int64, (JOINTS,), "for how many ticks a position has been the same while motors are on"),
+        "same_effort": (*_vector, "torque that was written when it changed last [N m]"),
+        "off": (*_vector, "by how much positions and speeds have disagreed lately [rad]"),
+        "way": (*_vector, "how far joints have turned meanwhile [rad]"),
+        "problem": (_i, (), "what was wrong first with a reading; 0 if nothing was"),
+        "problem_joint": (_i, (), "with which joint"),
+        "problem_value": (_f, (), "by how much it changed [rad, m]"),
+        "problem_ns": (_i, (), "in which time, or how far ahead the stamp is [ns]"),
+        "silence_ns": (_i, (), "age of the last reading that was refused for its age [ns]; 0 if none was"),
+        "is_distrusted": (_b, (), "positions of this tick are made up"),
+    },
+    "Modes": {
+        "mode": (np.int8, (), "`Mode`"),
+        "mode_is_new": (_b, (), "the plant has not been told it"),
+        "is_configured": (_b, (), "it was, since it was put where it is"),
+        "is_deactivating": (_b, (), "the stop that has begun ends in `SAFE_OFF`"),
+        "by_goal": (_b, (), "it moves because of a goal, not because of setpoints"),
+        "watchdog": (_i, (), "`Watchdog` flags raised since they were last taken"),
+        "limits": (_i, (), "`Limit` flags raised since they were last taken"),
+        "refusals": (np.int64, (len(Reason),), "how many commands were refused, by `Reason`"),
+    },
+    "Commands": {
+        "requested": (*_vector, "the setpoint that was taken last, before all limits"),
+        "setpoints_taken": (_i, (), "how many were"),
+        "due_ns": (_i, (), "when it was due [ns]"),
+        "taken_sequence": (_i, (), "its sequence number"),
+        "next_due_ns": (_i, (), "when the next in the queue is due [ns]; `NEVER` if none waits"),
+        "next_entry": (_i, (), "its place in the queue"),
+        "seen_head": (_i, (), "the head of the queue when that was found"),
+    },
+    "To the controller, for its next run": {
+        "entered": (_i, (), "modes that were entered, as bits"),
+        "has_setpoint": (_b, (), "there is a new setpoint"),
+        "goes_back": (_b, (), "its reference is to be again what is written"),
+    },
+    "From the controller": {
+        "command": (*_vector, "what is applied, after all limits"),
+        "actuators": (*_vector, "what it wants to write"),
+        "busy": (_b, (), "see `Controller.busy`"),
+        "follows_goal": (_b, (), "it follows one, and does not brake after one"),
+        "is_at_rest": (_b, (), "of an arm in `STOPPING`, when the tick began"),
+        "protective_stop": (_i, (), "`Watchdog` flag of a stop of its own that has just begun"),
+    },
+    "The guard": {
+        "written": (*_vector, "what may be written"),
+        "written_rate": (*_vector, "its last change, for each tick"),
+    },
+    "Wheels: twist, odometry, and how they turned since the last look": {
+        "target": (_f, (2,), "twist that is headed for [m/s, rad/s]"),
+        "before": (_f, (2,), "command of the tick before [m/s, rad/s]"),
+        "rate": (_f, (2,), "its last change, for each tick"),
+        "brakes_hard": (_b, (), "as far as a stop allows"),
+        "encoder": (_f, (2,), "[counts]"),
+        "odometry": (_f, (3,), "x, y [m], yaw [rad]"),
+        "ticks": (_i, (), "so far"),
+        "look_at": (np.int64, (3,), "tick of the next look, of the last one, and the reading's stamp then"),
+        "looks": (np.int64, (3,), "that found the two wheels and the gyroscope wrong, in a row"),
+        "asked": (_f, (2,), "[rad/s] times ticks that were commanded since the last look"),
+        "turned": (_f, (), "[rad/s] times ticks that the gyroscope read since then"),
+        "start": (_f, (2,), "[rad] of the wheels then"),
+        "first": (_f, (2,), "[rad] when it was configured"),
+        "stopped_for": (_i, (), "`Watchdog` flag of the last stop of its own"),
+        "stood": (_b, (), "the wheels had not turned at all then"),
+        "stopped_at": (_f, (4,), "[rad/s] of the wheels then, commanded and read"),
+        "late": (_f, (2, LOOKS), "[rad/s] commanded between looks, the newest first"),
+    },
+    "Reports: nothing in a tick goes by them": {
+        "measured": (*_vector, "where it is in the space of the commands"),
+        "torque": (*_vector, "of the joints [N m], a gripper's force [N]: measured if possible, otherwise commanded"),
+        "wrench": (_f, (6,), "that the surroundings put on the tool [N, N m]; 0 where it is not estimated"),
+        "pressed": (_f, (), "force that forbids to activate it [N]"),
+    },
+}
+"""Type, shape and meaning of the fields of a robot's record, by name, in groups."""
+STATE = record("state", [(name, *field[:2]) for group in STATE_FIELDS.values() for name, field in group.items()])
 
 WAITING = record(
     "queue",

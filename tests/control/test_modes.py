@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Watchdog
+from bhd_lerobot.control.record import command_age_ns
 from tests.cases import each_case
 from tests.control import support
 from tests.control.support import HZ, TICK_NS, Rig
@@ -167,7 +168,7 @@ def test_a_command_that_grows_old_ramps_to_zero_and_motion_resumes_with_the_next
     assert rig.mode == Mode.TRACKING
     assert rig.command == [0.1, 1.0]
     assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
-    assert rig.cerebellum.command_age_ns(rig.now - TICK_NS).tolist() == [500_000_000]
+    assert command_age_ns(rig.cerebellum.states, rig.now - TICK_NS).tolist() == [500_000_000]
     rig.tick()
     assert rig.mode == Mode.STOPPING
     assert rig.cerebellum.take_flags()[1].tolist() == [Watchdog.COMMAND_AGE]

@@ -50,10 +50,11 @@ def by_name(path: Path) -> str:
 
 def test_the_reference_is_up_to_date() -> None:
     pages = load_script("make_reference").pages()
-    options = ROOT / "docs" / "reference" / "options"
-    written = {path: path.read_text(encoding="utf-8") for path in [options.with_suffix(".md"), *options.iterdir()]}
+    folder = ROOT / "docs" / "reference"
+    files = folder / "options.md", folder / "record.md", *(folder / "options").iterdir()
+    written = {path: path.read_text(encoding="utf-8") for path in files}
     assert written == pages, "run: python scripts/make_reference.py"
-    assert sum(len(text.splitlines()) for text in pages.values()) <= 1190
+    assert sum(len(text.splitlines()) for text in pages.values()) <= 1310
 
 
 def test_an_option_without_a_description_is_found() -> None:

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult
-from bhd_lerobot.control.record import command_age_ns
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.realtime.frame_reader import Boundary
 from bhd_lerobot.robots.host.host import Host
@@ -53,14 +52,11 @@ def report_of(
     state, cerebellum = end["state"], mirror.cerebellum
     command, asked = (state[name][None, : cerebellum.width] for name in ("command", requested))
     columns = {
-        keys.COMMAND_AGE: np.array([command_age_ns(state, end["now_ns"])]) / NANOSECONDS,
-        keys.EFFORT: state["torque"][None, : cerebellum.controller.joints].copy(),
+        **mirror.recorded(state[None], end["now_ns"]),
         keys.LATENESS: np.array([after.lateness_ns / NANOSECONDS]),
         keys.OVERRUNS: np.array([int(end["overruns"] - begun["overruns"])]),
         keys.SKIPPED: np.array([int(end["skipped"] - begun["skipped"])]),
     }
-    if keys.WRENCH in mirror.columns:
-        columns[keys.WRENCH] = state["wrench"][None].copy()
     return FrameReport(
         applied=mirror.to_action(command),
         requested=mirror.to_action(asked),

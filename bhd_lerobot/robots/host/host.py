@@ -20,6 +20,7 @@ from bhd_lerobot.control.controller import Controller
 from bhd_lerobot.control.messages import NANOSECONDS, Limit, Reason, SendResult
 from bhd_lerobot.control.motion.planning import Planning
 from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.control.record import command_age_ns
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.robots.host.robots import Acceptance, ActionReport, Clock, Deliver, Frame, FrameReport
@@ -89,6 +90,7 @@ class Host:
                 [part.controller.width for part in self.parts],
             )
         )
+        self._has_wrench = bool(getattr(config, "wrench", False))
         self.running = np.ones(n, np.bool_)
         self.tick = 0
         self._start_tick = np.zeros(n, np.int64)
@@ -321,12 +323,6 @@ class Host:
         running = np.flatnonzero(self.running).tolist()
         results = {sim: receipt.all_results(sim, self.bridge.take_results(sim)) for sim in running}
         applied = self.to_action(cerebellum.command)
-        columns = {
-            keys.COMMAND_AGE: cerebellum.command_age_ns(self.bridge.now_ns) / NANOSECONDS,
-            keys.EFFORT: cerebellum.efforts.copy(),
-        }
-        if self.config_wrench:
-            columns[keys.WRENCH] = cerebellum.controller.contact_wrench.copy()
         return FrameReport(
             applied=applied,
             requested=self._requested(command, applied),
@@ -335,7 +331,7 @@ class Host:
             watchdog=watchdog,
             mode=cerebellum.mode.copy(),
             truth=self.truth,
-            columns=columns,
+            columns=self.recorded(cerebellum.states, self.bridge.now_ns),
             results={sim: ended for sim, ended in results.items() if ended},
             refusals=receipt.refusals,
         )
@@ -377,10 +373,20 @@ class Host:
         """The present `Mode` of each robot, shape (n,)."""
         return self.cerebellum.mode
 
-    @property
-    def config_wrench(self) -> bool:
-        """Whether the contact wrench is recorded."""
-        return bool(getattr(self.config, "wrench", False))
+    def recorded(self, states: NDArray, now_ns: int) -> dict[str, NDArray]:
+        """Return what frames hold of records, beside what was applied and flags, by key.
+
+        Args:
+            states: the records, shape (n,).
+            now_ns: the time of their tick [ns].
+        """
+        columns = {
+            keys.COMMAND_AGE: command_age_ns(states, now_ns) / NANOSECONDS,
+            keys.EFFORT: states["torque"][:, : self.controller.joints].copy(),
+        }
+        if self._has_wrench:
+            columns[keys.WRENCH] = states["wrench"].copy()
+        return columns
 
     @property
     def columns(self) -> dict[str, tuple[str, ...]]:
@@ -389,7 +395,7 @@ class Host:
             keys.COMMAND_AGE: (),
             keys.EFFORT: tuple(f"{joint}.effort" for joint in self.body.joints),
         }
-        if self.config_wrench:
+        if self._has_wrench:
             columns[keys.WRENCH] = tuple(f"tool_{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz")
         if self.world is not None:
             nq, nv = (part.shape[1] for part in self.physics)
