@@ -113,9 +113,7 @@ def test_it_reads_and_drives_the_robot_and_stops_it_when_commands_cease_and_when
     refused = f"Another program of this machine commands /cmd_vel in ROS domain {shared}"
     with pytest.raises(RealtimeError, match=refused):
         make(shared).open()
-    drive(plant, lambda: moves(robot), "the robot moves")
-    plant.read(out)
-    assert (out.position > before).all()
+    drive(plant, lambda: [plant.read(out), moves(robot) and (out.position > before).all()][1], "the robot moves")
     # turtlebot3_node gives wheel speeds in m/s; here they are in rad/s: 0.1 m/s on wheels of 33 mm.
     until(lambda: [plant.write(FORWARD), plant.read(out), out.velocity.min() > 2.5][2], "both wheels turn at 3 rad/s")
     np.testing.assert_allclose(out.velocity, 0.1 / 0.033, rtol=0.1)
