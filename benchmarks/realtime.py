@@ -43,7 +43,7 @@ from bhd_lerobot.tasks.pick import PickConfig, PickTask
 
 RATES = {"turtlebot3": 200, "ur5": 1000, "ur5_impedance": 1000}  # control ticks and physics steps a second [Hz]
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "ur5_impedance": ("ur5", {"control": "impedance", "tool_pose": True})
+    "ur5_impedance": ("ur5", {"control": "impedance", "action_space": "tool", "tool_pose": True})
 }
 CONDITIONS = ("quiet", "load")
 TWIN, OURS, VIDEO = "C++ twin", "bhd-lerobot", "bhd-lerobot, torch and video"

@@ -458,10 +458,11 @@ class Cerebellum:
         self.states["is_configured"] |= mask
         self.may_write = True  # before, it was not known where the robots are
         np.copyto(self.requested, self.command, where=mask[:, None])
-        own, limits = self.controller, _object(self.numbers)
+        own = self.controller
+        limits, its = _object(self.numbers), _object(own.arm_limits)
         for sim in ids.tolist():  # no tick has reported them yet
-            parts = (_object(part, sim) for part in (self.states, own.monitors, own.arms, own.springs))
-            report(*parts, limits, _object(own.arm_limits))
+            state, *parts = (_object(part, sim) for part in (self.states, own.monitors, own.arms, own.springs))
+            report(state, parts[0], parts[1], parts[2], limits, its)
 
     def _start_writing(self, ids: NDArray[np.intp]) -> None:
         """Start from commands that the next ones need not be near to: robots were put or moved somewhere else."""
