@@ -4,7 +4,8 @@ Those of this package are in the tables here; importing this module registers al
 packages add theirs with `register_robot`, `register_task`, `register_brain` and `register_arena`.
 """
 
-from collections.abc import Callable, Set
+from collections.abc import Callable, Mapping, Set
+from dataclasses import fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ import bhd_lerobot.tasks.pick
 import bhd_lerobot.tasks.reach  # noqa: F401  as the others above, registers its configuration
 from bhd_lerobot.bodies.body import PARTS, Body
 from bhd_lerobot.bodies.registry import BODIES, parts_of_type
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.options.registry import Registry, with_article
 from bhd_lerobot.policies.baselines import NoopBrain, RandomBrain
 from bhd_lerobot.policies.blanked import BlankedBrain, BlankedConfig
@@ -308,6 +309,24 @@ def action_names_of(config: BrainConfig) -> tuple[str, ...]:
 
 
 # --- making ----------------------------------------------------------------------------------------------------------
+
+
+def recorded_robot(recorded: Mapping[str, Any]) -> Any:
+    """Return the configuration of the robot that recorded a dataset, in simulated time and without cameras.
+
+    Args:
+        recorded: its options, as the dataset names them.
+
+    Raises:
+        DatasetError: there is no such robot.
+    """
+    try:
+        kind = RobotConfig.get_choice_class(recorded["type"])
+    except KeyError:
+        raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
+    known = {field.name for field in fields(kind)}
+    parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
+    return kind(**{**parameters, "camera": False, "clock": "lockstep"})
 
 
 def make_simulation(config: Any, n: int = 1, threads: int | None = None) -> "Simulation":

@@ -141,7 +141,8 @@ class Rows:
     def _perceived(self, _: dict[str, Any], refs: list[str], seeds: list[int]) -> Iterator[Row]:
         saw = self._get(refs[0], seeds[0])
         median, most, _far = (1000 * (math.nan if value is None else value) for value in saw["error_m"])
-        what = f"seed_{seeds[0]}: in {saw['episodes']} tables, randomised"
+        training = "" if seeds[0] is None else f"seed_{seeds[0]}: "
+        what = f"{training}in {saw['episodes']} tables, randomised"
         yield Row(f"{what}: error of what was asked for", f"median {median:.1f} mm, 90 % below {most:.1f} mm")
         yield Row(f"{what}: wrong object", rate(saw["wrong"], {}))
         yield Row(f"{what}: within the radius stated for 90 %", rate(saw["in_90"], {}))

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from bhd_lerobot.bodies.body import Workspace
 from bhd_lerobot.errors import ConfigError, unknown_name
 
 MAX_OBJECTS = 5  # all simulations of a batch share one model, so the number of bodies is fixed
@@ -53,7 +54,15 @@ class CameraView:
 
 
 SCENE_CAMERA = CameraView((1.22, -0.62, 0.78), (0.37, 0.02, 0.15), 48.0)
-"""The camera `scene` beside the table, where a scene's `Variation` does not move it."""
+"""The camera `scene` beside a UR5's table, where a scene's `Variation` does not move it."""
+_CORNER = math.hypot(0.65, 0.30)  # [m] from a UR5's base to the farther corners of the part where things stand
+
+
+def scene_camera(workspace: Workspace) -> CameraView:
+    """Return the camera `scene` beside an arm's table: of one that is half as large it stands half as far away."""
+    k = math.hypot(*workspace.table[1]) / _CORNER
+    (px, py, pz), (tx, ty, tz) = SCENE_CAMERA.position, SCENE_CAMERA.target
+    return replace(SCENE_CAMERA, position=(k * px, k * py, k * pz), target=(k * tx, k * ty, k * tz))
 
 
 @dataclass(frozen=True)

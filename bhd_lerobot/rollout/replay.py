@@ -5,7 +5,7 @@ the robot is put into each recorded physics state, and its sensors are read agai
 """
 
 import json
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from bhd_lerobot.datasets.format.identity import default_root
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.options.declared import OneOf, Options, Range
-from bhd_lerobot.registry import make_simulation
+from bhd_lerobot.registry import make_simulation, recorded_robot
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.provenance import command_from_json, versions
@@ -123,7 +123,7 @@ class Replay:
         self.scene = scene_from_json(metadata["scene"])
         self.seed = int(metadata["seed"])
         self.fps = summary.fps
-        self.simulation = make_simulation(_robot_config(summary.recording["robot"]))
+        self.simulation = make_simulation(recorded_robot(summary.recording["robot"]))
         self.goals: dict[int, list[BrainCommand]] | None = None
         if metadata.get("goals"):
             self.goals = {}
@@ -286,15 +286,3 @@ def _angle(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[n
     apart, across = first - second, first + second
     chord = np.sqrt(np.minimum((apart * apart).sum(axis=1), (across * across).sum(axis=1)))
     return np.asarray(4 * np.arcsin(np.minimum(chord / 2, 1.0)))
-
-
-def _robot_config(recorded: dict[str, Any]) -> Any:
-    """Return the configuration of the robot that recorded an episode, without cameras."""
-    try:
-        kind = RobotConfig.get_choice_class(recorded["type"])
-    except KeyError:
-        raise DatasetError(f"The dataset was recorded by an unknown robot, {recorded.get('type')!r}.") from None
-    known = {field.name for field in fields(kind)}
-    # Replayed in simulated time, whatever clock it was recorded on.
-    parameters = {key: value for key, value in recorded.items() if key in known and key != "realtime"}
-    return kind(**{**parameters, "camera": False, "clock": "lockstep"})

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, GripperSpec, Shape
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, SCENE_CAMERA, CameraView
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, CameraView, scene_camera
 from bhd_lerobot.sim.backdrop import add_backdrop
 from bhd_lerobot.sim.engine import mujoco
 
@@ -40,7 +40,7 @@ def add_table_stage(spec: mujoco.MjSpec, root: str, arm: Arm, fixtures: Sequence
     _add_table(spec)
     _add_lights(spec)
     overview = replace(_OVERVIEW, fovy=_OVERVIEW.fovy * max(1.0, arm.chain.reach / _OVERSEEN))
-    for name, view in (("scene", SCENE_CAMERA), ("overview", overview)):
+    for name, view in (("scene", scene_camera(arm.workspace)), ("overview", overview)):
         axes = _towards(view.position, view.target)
         spec.worldbody.add_camera(name=name, pos=view.position, xyaxes=axes, fovy=view.fovy)
     _add_handled(spec, arm.gripper)

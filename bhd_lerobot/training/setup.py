@@ -22,6 +22,7 @@ from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
 from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
 from bhd_lerobot.policies.learned.policy import check_statistics
 from bhd_lerobot.policies.trained_steps import floored
+from bhd_lerobot.registry import ROBOTS, recorded_robot
 from bhd_lerobot.stock import (
     LeRobotDatasetMetadata,
     dataset_to_policy_features,
@@ -162,12 +163,22 @@ def _check_truth(policy: Any, meta: LeRobotDatasetMetadata) -> None:
             )
 
 
+def _place_camera(policy: Any, meta: LeRobotDatasetMetadata) -> None:
+    """Let a policy take from the arm of a simulation where its camera stands, and the table before it."""
+    robot = PolicyContract.from_dataset(meta).robot or {}
+    if policy.pretrained_path is None and not policy.is_placed and robot.get("type") in ROBOTS:
+        arm = recorded_robot(robot).body().arm
+        if arm is not None:
+            policy.stand_before(arm.workspace)
+
+
 def build_policy(config: BhdTrainConfig, meta: LeRobotDatasetMetadata, accelerator: Any = None) -> Any:
     """Return the policy, new or from its checkpoint, on its device; all of its randomness is the seed's."""
     policy: Any = config.policy
     check_features(policy, meta, config.rename_map)
     if getattr(policy, "learns_true_poses", False):
         _check_truth(policy, meta)
+        _place_camera(policy, meta)
     if policy.pretrained_path is not None:
         # One folder on this machine, so that what is checked is what LeRobot loads.
         policy.pretrained_path = find_checkpoint(policy.pretrained_path, policy.pretrained_revision).resolve()

@@ -226,17 +226,15 @@ class LanguageBrain(PickBrain):
                 factor = (self._max_opening - _FIT) / least
                 grasp = super()._choose_grasp(replace(target, size=(factor * length, factor * width, height)), others)
         # The fingers need more room beside what is not known exactly.
-        return (
-            None
-            if grasp is None
-            else replace(grasp, opening=min(self._max_opening, grasp.opening + 2 * target.error_90_m))
-        )
+        if grasp is None:
+            return None
+        return grasp.opened(min(self._max_opening, grasp.opening + 2 * target.error_90_m), self._handling)
 
     def _is_held(self, opening: float, grasp: Grasp) -> bool:
         if self.perceiver is None:
             return super()._is_held(opening, grasp)
         # Its width is not known exactly: nothing is held if the fingers came to where they were sent.
-        return opening >= grasp.width - SQUEEZE + _CLOSED
+        return opening >= max(0.0, grasp.width - SQUEEZE) + _CLOSED
 
     def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
         if self.perceiver is None:

@@ -75,6 +75,16 @@ class Grasp:
         """By which the opening is wider than for an object whose pose is known exactly [m]; negative if narrower."""
         return self.opening - self.width - self.usual
 
+    def opened(self, opening: float, handling: Handling) -> "Grasp":
+        """Return the grasp with the fingers opened to another opening [m], the object still in their middle.
+
+        Where one finger alone moves, the tool stands farther to its side, so that the other has as much room.
+        """
+        aside = 0.0 if handling.fixed is None else (opening - self.opening) / 2
+        return replace(
+            self, opening=opening, x=self.x + aside * math.cos(self.yaw), y=self.y + aside * math.sin(self.yaw)
+        )
+
     def pose(self, height: float) -> Pose:
         """Return the tool's pose above the grasp, at a height over the table [m]."""
         return pointing_down(self.x, self.y, height, self.yaw)

@@ -7,13 +7,16 @@ from typing import Annotated, Any, ClassVar
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.utils.constants import OBS_ENV_STATE
 
-from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView
+from bhd_lerobot.bodies.body import Arm, Workspace
+from bhd_lerobot.bodies.registry import body_with
+from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS, SCENE_CAMERA, CameraView, scene_camera
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.declared import Count, Finite, Positive, Range
+from bhd_lerobot.options.declared import Count, Finite, NotNegative, Range
 from bhd_lerobot.policies.perception.camera import Projection, Region
 from bhd_lerobot.policies.trained import TrainedConfig, names_of
 
 STRIDE = 4  # [px] of the image for each cell of the grid that the network answers on
+_TALLEST = 0.13  # [m] of the objects of a UR5
 LABELS = tuple(f"object_{number}_{name}" for number in range(MAX_OBJECTS) for name in OBJECT_FIELDS)
 
 
@@ -23,6 +26,8 @@ class PerceptionConfig(TrainedConfig):
     """Configuration of the policy type ``bhd_perception``.
 
     It reads one image. The true poses in `observation.environment_state` are what it learns to say, never an input.
+    What is not said of camera and table is that of the arm that recorded the dataset, in simulation; `bhd-train` finds
+    it out, and with other programs it is that of a UR5.
 
     Attributes:
         camera: name of the camera that it looks through.
@@ -31,7 +36,8 @@ class PerceptionConfig(TrainedConfig):
         camera_fovy: its vertical field of view [deg].
         camera_roll: by which it is turned clockwise about its line of sight [rad].
         area: where objects stand, in the base frame: smallest x, smallest y, largest x, largest y [m].
-        object_height: the tallest object [m].
+        object_height: the tallest object [m]; the arm's if 0.
+        scale: measures of the objects, compared with those of a UR5's; the arm's if 0.
         margin: by how much the camera may be moved, as a share of the image's width that is looked at around the area.
         channels: of the network where the image is finest.
         hidden: of the network where it is coarser.
@@ -52,12 +58,13 @@ class PerceptionConfig(TrainedConfig):
     learns_true_poses: ClassVar[bool] = True
 
     camera: str = "scene"
-    camera_position: list[Finite] = field(default_factory=lambda: list(SCENE_CAMERA.position))
-    camera_target: list[Finite] = field(default_factory=lambda: list(SCENE_CAMERA.target))
+    camera_position: list[Finite] = field(default_factory=list)
+    camera_target: list[Finite] = field(default_factory=list)
     camera_fovy: Annotated[float, Range("(0, 180)")] = SCENE_CAMERA.fovy
     camera_roll: float = SCENE_CAMERA.roll
-    area: list[Finite] = field(default_factory=lambda: [0.35, -0.30, 0.65, 0.30])
-    object_height: Positive = 0.13
+    area: list[Finite] = field(default_factory=list)
+    object_height: NotNegative = 0.0
+    scale: NotNegative = 0.0
     margin: Annotated[float, Range("[0, 1)")] = 0.06
     channels: Count = 32
     hidden: Count = 48
@@ -82,15 +89,35 @@ class PerceptionConfig(TrainedConfig):
         super().__post_init__()
         for name, count in (("camera_position", 3), ("camera_target", 3), ("area", 4)):
             values = getattr(self, name)
-            if len(values) != count:
+            if len(values) not in (0, count):
                 raise ConfigError(f"policy.{name} is {values}; it must be {count} finite numbers [m].")
-        if not (self.area[0] < self.area[2] and self.area[1] < self.area[3]):
+        if self.area and not (self.area[0] < self.area[2] and self.area[1] < self.area[3]):
             raise ConfigError(f"policy.area is {self.area}; it must be smallest x, smallest y, largest x, largest y.")
-        if self.camera_position[2] <= 0.0 or self.camera_target[:2] == self.camera_position[:2]:
+        position, target = self.camera_position, self.camera_target
+        if position and (position[2] <= 0.0 or position[:2] == target[:2]):
             raise ConfigError(
                 f"policy.camera_position is {self.camera_position} and policy.camera_target {self.camera_target}; the "
                 "camera must stand above the table, and not look straight down."
             )
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether everything is said of the camera and the table."""
+        return all((self.camera_position, self.camera_target, self.area, self.object_height, self.scale))
+
+    def stand_before(self, workspace: Workspace) -> None:
+        """Take what was not said of the camera and the table from an arm's."""
+        view, (low, high) = scene_camera(workspace), workspace.table
+        self.camera_position = self.camera_position or list(view.position)
+        self.camera_target = self.camera_target or list(view.target)
+        self.area = self.area or [*low, *high]
+        self.scale = self.scale or workspace.handling.scale
+        self.object_height = self.object_height or _TALLEST * self.scale
+
+    def settle(self) -> None:
+        """Take what nobody said from a UR5's, and check that the camera sees the table."""
+        self.stand_before(body_with(Arm).need(Arm).workspace)
+        _ = self.region
 
     @property
     def view(self) -> CameraView:
@@ -143,4 +170,4 @@ class PerceptionConfig(TrainedConfig):
             )
         self.input_features = {self.image_key: known[self.image_key]}
         self.output_features = {OBS_ENV_STATE: known[OBS_ENV_STATE]}
-        _ = self.region
+        self.settle()

@@ -24,6 +24,7 @@ from bhd_lerobot.policies.perception.configuration_perception import STRIDE, Per
 from bhd_lerobot.policies.perception.labels import Labels
 from bhd_lerobot.policies.perception.refit import fit_view, matched
 
+# What has a length is of a UR5's objects; of others times `config.scale`.
 _PLANE = 0.04  # [m] height of the plane that cells are projected to: about the middle of objects
 _SPREAD = 1.5  # [cells] standard deviation of the bump in the map of presence that an object's centre is to leave
 _NEAR = 0.3  # cells in which that bump is at least this high say where the object is
@@ -90,6 +91,7 @@ class PerceptionPolicy(PreTrainedPolicy):
     def __init__(self, config: PerceptionConfig, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
+        self._shift, self._error, self._size = (config.scale * unit for unit in (_SHIFT, _ERROR, _SIZE))
         self.network = _Network(config)
         self._aim()
         # What stated errors are multiplied by; not a number until errors on held-out images are known.
@@ -105,7 +107,7 @@ class PerceptionPolicy(PreTrainedPolicy):
             np.arange((bottom - top) // STRIDE), np.arange((right - left) // STRIDE), indexing="ij"
         )
         pixels = np.stack([left + STRIDE * (column + 0.5), top + STRIDE * (row + 0.5)], axis=-1)
-        plane = config.projection.on_plane(pixels, _PLANE)
+        plane = config.projection.on_plane(pixels, config.scale * _PLANE)
         for name, values in (("_plane", plane), ("_pixels", pixels)):
             self.register_buffer(name, torch.tensor(values, dtype=torch.float32, device=device), persistent=False)
 
@@ -230,11 +232,11 @@ class PerceptionPolicy(PreTrainedPolicy):
 
     def _errors(self, answers: Mapping[str, Tensor], true: Labels) -> dict[str, Tensor]:
         """Return the parts of the loss of every cell, as if each were near an object, shape (batch, h, w)."""
-        above = (self.places(answers) - true.position)[..., 2].abs() / _ERROR
+        above = (self.places(answers) - true.position)[..., 2].abs() / self._error
         turn = torch.stack([of(times * true.yaw) for times in (2, 4) for of in (torch.cos, torch.sin)], dim=-1)
         entropy = functional.cross_entropy(answers["colour"].movedim(-1, 1), true.colour, reduction="none")
         box = functional.binary_cross_entropy_with_logits(answers["is_box"], true.is_box, reduction="none")
-        size = answers["size"] - torch.log(true.size.clamp_min(1e-3) / _SIZE)
+        size = answers["size"] - torch.log(true.size.clamp_min(1e-3) / self._size)
         return {
             "above": above,
             "is_box": box,
@@ -248,7 +250,7 @@ class PerceptionPolicy(PreTrainedPolicy):
         """Return the loss of x and y of every cell, and how far off they are [m], shape (batch, h, w)."""
         apart = (self.places(answers) - true.position)[..., :2].norm(dim=-1)
         scale = torch.exp(answers["log_error"].clamp(*_LOG_ERROR))
-        return apart / _ERROR / scale + 2 * scale.log(), apart
+        return apart / self._error / scale + 2 * scale.log(), apart
 
     @torch.no_grad()
     def _calibrate(self, answers: Mapping[str, Tensor], labels: Labels) -> None:
@@ -359,7 +361,7 @@ class PerceptionPolicy(PreTrainedPolicy):
 
     def places(self, answers: Mapping[str, Tensor]) -> Tensor:
         """Return where every cell states that the object near it is, in the base frame [m], shape (batch, h, w, 3)."""
-        return self._plane + _SHIFT * answers["shift"]
+        return self._plane + self._shift * answers["shift"]
 
     def _found(self, answers: Mapping[str, Tensor], factor: float) -> list[Detections]:
         presence = torch.sigmoid(answers["presence"])
@@ -374,13 +376,13 @@ class PerceptionPolicy(PreTrainedPolicy):
             one = Detections(
                 presence=presence[cells],
                 position=position[cells],
-                scale=factor * _ERROR * torch.exp(answers["log_error"][cells].clamp(*_LOG_ERROR)),
+                scale=factor * self._error * torch.exp(answers["log_error"][cells].clamp(*_LOG_ERROR)),
                 is_box=torch.sigmoid(answers["is_box"][cells]),
                 colour=torch.softmax(answers["colour"][cells], dim=-1),
-                size=_SIZE * torch.exp(answers["size"][cells]),
+                size=self._size * torch.exp(answers["size"][cells]),
                 yaw=box_yaw(answers["yaw"][cells]),
             )
-            found.append(_distinct(one))
+            found.append(_distinct(one, self.config.scale * _DISTINCT))
         return found
 
 
@@ -400,12 +402,12 @@ def box_yaw(answers: Tensor) -> Tensor:
     return torch.atan2(double.sin(), double.cos()) / 2
 
 
-def _distinct(found: Detections) -> Detections:
-    """Leave out what is at the same place as something surer."""
+def _distinct(found: Detections, near: float) -> Detections:
+    """Leave out what is nearer than this to something surer [m]."""
     apart = torch.cdist(found.position[:, :2], found.position[:, :2])
     kept: list[int] = []
     for row in range(len(apart)):
-        if not kept or float(apart[row, kept].min()) > _DISTINCT:
+        if not kept or float(apart[row, kept].min()) > near:
             kept.append(row)
     return Detections(*(getattr(found, name)[kept] for name in found.__dataclass_fields__))
 

@@ -112,4 +112,4 @@ class PixelsConfig(PerceptionConfig):
         self.check_columns(width)
         self.input_features = {self.image_key: known[self.image_key], OBS_STATE: known[OBS_STATE]}
         self.output_features = {key: known[key] for key in (ACTION, OBS_ENV_STATE) if key in known}
-        _ = self.region
+        self.settle()

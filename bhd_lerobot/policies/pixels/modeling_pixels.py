@@ -33,11 +33,11 @@ _TARGET = OBJECT_FIELDS.index("target")
 _VALUES = 16  # numbers that each further place of the image gives
 _SAME = (
     *("camera", "camera_position", "camera_target", "camera_fovy", "camera_roll"),
-    *("area", "object_height", "margin", "image_size"),
+    *("area", "object_height", "scale", "margin", "image_size"),
 )
 _SHAPE = ("channels", "hidden", "context")
 _SHARPNESS = 4  # attention is to fall off from an object's centre as this power of how near a cell is
-_WITHIN = 0.03  # [m] cells whose places are so near to each other's are about the same object
+_WITHIN = 0.03  # [m] cells whose places are so near to each other's are about the same object, of a UR5's measures
 _THUMBNAIL = 8  # every so many pixels of an image, by which it is known again, with the sum of all
 _KEPT = 16_384  # images of which it is kept what is known of their cells, some 35 kB each
 
@@ -70,7 +70,8 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         self.register_buffer("_middle", torch.tensor(middle), persistent=False)
         self._state_mean: Tensor
         self._state_std: Tensor
-        self.register_buffer("_extent", torch.tensor([(right - left) / 2, (top - bottom) / 2, 0.05]), persistent=False)
+        extent = [(right - left) / 2, (top - bottom) / 2, 0.05 * config.scale]
+        self.register_buffer("_extent", torch.tensor(extent), persistent=False)
         self._action_size = int(config.output_features[ACTION].shape[0])  # type: ignore[index]
         cell = config.channels + self.perception.answer_size
         self.reader = _Reader(config.text_dim)
@@ -290,7 +291,7 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         """
         place = cells[..., :2] * self._extent[:2]
         most = attention.argmax(1, keepdim=True).unsqueeze(-1).expand(-1, -1, 2)
-        weight = attention * ((place - place.gather(1, most)).norm(dim=-1) < _WITHIN)
+        weight = attention * ((place - place.gather(1, most)).norm(dim=-1) < _WITHIN * self.config.scale)
         return weight / weight.sum(1, keepdim=True)
 
     def _act(self, seen: Tensor, state: Tensor) -> Tensor:

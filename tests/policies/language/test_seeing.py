@@ -246,6 +246,16 @@ def test_an_arm_that_does_not_get_out_of_the_way_is_not_looked_past() -> None:
     assert table.eyes.count == 1
 
 
+@each_case("width", [0.012, 0.03, 0.06])
+def test_fingers_that_close_on_nothing_hold_nothing_however_thin_the_object_is(width: float) -> None:
+    thing = TableObject("box", "red", 0.04, width / 2, 0.03, 0.5, 0.0)
+    for opening, then in ((0.0, "back"), (width, "lift")):
+        table = Table([seen(thing, 0)], instruction="pick up the red box")
+        table.grasp(max(opening, width - 0.03))
+        table.end()
+        assert table.steps[-1] == then
+
+
 def test_after_a_miss_it_goes_home_and_looks_again() -> None:
     """The object stands elsewhere the second time, and under another number."""
     table = Table(BOTH, (seen(BOX, 0), seen(CUP, 1, off=0.05)))

@@ -62,6 +62,20 @@ def test_wider_is_wider_where_the_gripper_can_and_a_side_that_leaves_less_is_lef
         assert min(length, width) + wider > MAX_OPENING - 0.01
 
 
+@given(angles, st.floats(0.02, 0.07), st.floats(0.0, 0.03))
+def test_fingers_that_are_opened_further_keep_the_object_in_their_middle_also_if_one_alone_moves(yaw, width, wider):
+    for handling in (HANDLING, dataclasses.replace(HANDLING, fixed=0.013)):
+        usual, wide = (
+            plan_grasp(box(0.12, width, yaw=yaw), [], MAX_OPENING, handling=handling, wider=more)
+            for more in (0.0, wider)
+        )
+        assert usual is not None
+        assert wide is not None
+        opened = usual.opened(wide.opening, handling)
+        assert (opened.opening, opened.yaw) == (wide.opening, wide.yaw)
+        assert (opened.x, opened.y) == pytest.approx((wide.x, wide.y), abs=1e-12)
+
+
 @each_case("one", [box(0.09, 0.079), cup(0.079), box(0.3, 0.3)])
 def test_what_fits_on_no_side_has_no_grasp(one: SeenObject) -> None:
     assert plan_grasp(one, [], MAX_OPENING, handling=HANDLING) is None

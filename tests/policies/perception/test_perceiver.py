@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from bhd_lerobot.bodies.body import Arm
+from bhd_lerobot.bodies.tabletop import scene_camera
+from bhd_lerobot.bodies.ur import ur
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.errors import ConfigError, DatasetError, PerceptionError, RenderingError
 from bhd_lerobot.evaluation.config import EvalConfig
@@ -92,6 +95,29 @@ def test_it_is_evaluated_by_itself_and_reports_how_well_it_saw(run: Path, tmp_pa
     assert "What was seen" in result.report.read_text()
     weights = result.results.config["brains"]["language"]["perception"]["weights"]
     assert weights.startswith("sha256:")
+
+
+def test_where_camera_and_table_are_it_is_told_by_the_arm_that_recorded(run: Path, tmp_path: Path) -> None:
+    try:
+        run_record(
+            tmp_path / "looks",
+            **(ARM | {"robot__type": "ur3e"}),
+            **CAMERA,
+            brain__type="noop",
+            dataset__num_episodes=8,
+            dataset__episode_time_s=0.04,
+        )
+    except RenderingError as error:
+        pytest.skip(f"no image can be rendered on this machine: {error}")
+    train(tmp_path / "looks", tmp_path / "run", steps=2, batch_size=4)
+    for folder, robot in ((run, "ur5"), (tmp_path / "run", "ur3e")):
+        saved = json.loads((folder / "checkpoints/last/pretrained_model/config.json").read_text())
+        workspace = ur(robot).need(Arm).workspace
+        view = scene_camera(workspace)
+        assert saved["camera_position"] == list(view.position)
+        assert saved["camera_target"] == list(view.target)
+        assert saved["area"] == [*workspace.table[0], *workspace.table[1]]
+        assert saved["scale"] == workspace.handling.scale
 
 
 def test_without_a_task_that_tells_anything_the_brain_is_recorded(run: Path, tmp_path: Path) -> None:
