@@ -56,7 +56,6 @@ class Rig:
             elapsed = self.ticks * TICK
             self.server.serve(self.now)
             self.cerebellum.tick(elapsed)
-            self.cerebellum.report()
             self.row["state"] = self.cerebellum.states
             self.row["tick"], self.row["now_ns"] = self.ticks, elapsed
             self.other.ring.publish(self.row)
