@@ -3,6 +3,7 @@
 It counts results that come twice, that nobody asked for, or never.
 """
 
+import itertools
 import math
 import signal
 import time
@@ -27,14 +28,18 @@ parser.add_argument("--max-velocity", type=float, default=0.0)
 parser.add_argument("--patience", type=float, default=60.0, help="the longest wait for a result [s]")
 parser.add_argument("--linger", type=float, default=2.0, help="the wait for results that come twice, at the end [s]")
 parser.add_argument("--preempt", type=float, help="send the next goal after this time, without waiting [s]")
+parser.add_argument("--burst", type=int, metavar="N", help="send so many goals at once, the given ones in turn")
+parser.add_argument("--depth", type=int, default=10, help="of the queues of goals and results")
 args = parser.parse_args()
+if args.burst:
+    args.goal = list(itertools.islice(itertools.cycle(args.goal), args.burst))
 
 
 class Brain:
     def __init__(self, node: Node) -> None:
         self.node = node
-        self.commands = node.create_publisher(BrainCommand, "/brain/command", 10)
-        node.create_subscription(BrainResult, "/brain/result", self.on_result, 10)
+        self.commands = node.create_publisher(BrainCommand, "/brain/command", args.depth)
+        node.create_subscription(BrainResult, "/brain/result", self.on_result, args.depth)
         node.create_subscription(CerebellumState, "/cerebellum/state", self.on_state, 10)
         self.sent: dict[str, float] = {}  # task -> when [s]
         self.results: dict[str, list[dict[str, Any]]] = {}
@@ -54,7 +59,8 @@ class Brain:
         last = max(self.sent.values(), default=-math.inf)
         may_send = not waiting if args.preempt is None else now - last >= args.preempt
         if len(self.sent) < len(args.goal) and may_send:
-            self.send(args.goal[len(self.sent)])
+            for goal in args.goal[len(self.sent) :][: args.burst or 1]:
+                self.send(goal)
         elif len(self.sent) == len(args.goal) and not waiting and args.goal:
             self.finished = self.finished or now
             if now - self.finished >= args.linger:

@@ -2,6 +2,8 @@
 
 import os
 import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -103,38 +105,89 @@ def test_what_commands_a_robot_twice_is_named(domain: int, tmp_path: Path) -> No
             side.served.wait_for("/brain/cmd_vel has 2 publishers, brain and topic_pub: the newest message counts")
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+ENDS = pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+SLOWLY = {"task_id": "slow", "max_velocity": 0.1}
+SLOWLY |= {"target_pose": {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}}
+
+
+def has_moved(log: Path) -> bool:
+    """Return whether an arm is on its way from where it was first."""
+    return bool(np.ptp([line["position"] for line in log_of(log, "state")], axis=0).max() > 0.02)
+
+
+def is_at_rest(log: Path) -> bool:
+    """Return whether an arm stood for the last half second."""
+    states = log_of(log, "state")
+    last = [one["position"] for one in states if one["monotonic"] > states[-1]["monotonic"] - 0.5]
+    return len(last) > 10 and bool(np.ptp(last, axis=0).max() < 1e-3)
+
+
+@contextmanager
+def moving(robot: str, domain: int, folder: Path) -> Iterator[tuple[Program, Callable[[], bool]]]:
+    """A robot that is moved through a bridge, and whether it stands."""
+    waits = "--robot.realtime.brain_timeout_s=0.5"
+    if robot == "turtlebot3":
+        with base(domain, folder, waits) as (side, _, log):
+            until(lambda: drives(side, log), "it drives")
+            yield side.served, lambda: twist(log) == STAND
+    else:
+        with arm(domain, folder, waits) as (bridge, _, log), Node("brain", NetworkConfig(domain=domain)) as node:
+            Side(bridge, node).send("/brain/command", "bhd_interfaces/msg/BrainCommand", SLOWLY)
+            until(lambda: has_moved(log), "it moves")
+            yield bridge, lambda: is_at_rest(log)
+
+
+@ENDS
 @pytest.mark.parametrize("part", ["", "robots.host.process", "ros2.live.process node"], ids=["bridge", "loop", "node"])
-def test_a_base_stands_whichever_process_ends(part: str, number: signal.Signals, domain: int, tmp_path: Path) -> None:
-    with base(domain, tmp_path, "--robot.realtime.brain_timeout_s=0.5") as (side, _, log):
-        until(lambda: drives(side, log), "it drives")
-        pid = side.served.pid_of(part) if part else side.served.pid
+@pytest.mark.parametrize("robot", ["turtlebot3", "ur5"])
+@pytest.mark.thorough(but=7)
+def test_a_robot_stands_whichever_process_ends(robot, part, number, domain, tmp_path):
+    with moving(robot, domain, tmp_path) as (bridge, stands):
+        pid = bridge.pid_of(part) if part else bridge.pid
         os.kill(pid, number)
         try:
-            until(lambda: twist(log) == STAND, "it stands")
+            until(stands, "it stands")
             if part and number == signal.SIGKILL:
-                assert side.served.process.wait() == 2
+                assert bridge.process.wait() == 2
         finally:
             if number == signal.SIGSTOP:
                 os.kill(pid, signal.SIGCONT)
 
 
-def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_is_back(domain, tmp_path):
-    with arm(domain, tmp_path, silence_s=0.5) as (bridge, robot, _):
-        robot.signal(signal.SIGKILL)
+def test_a_goal_is_followed_to_its_end_without_its_brain(domain: int, tmp_path: Path) -> None:
+    with arm(domain, tmp_path) as (bridge, _, log), Node("other", NetworkConfig(domain=domain)) as node:
+        side = Side(bridge, node)
+        with Peer("brain_node.py", NEAR[0], "--max-velocity=0.3", domain=domain) as brain:
+            brain.wait_event("command")
+            until(lambda: has_moved(log), "it moves")
+            brain.signal(signal.SIGKILL)
+        [result] = side.ended(1)
+        assert result.success, result.message
+
+
+@ENDS
+def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_is_back(number, domain, tmp_path):
+    with (
+        arm(domain, tmp_path, silence_s=0.5) as (bridge, robot, _),
+        ExitStack() as back,
+        Node("brain", NetworkConfig(domain=domain)) as node,
+    ):
+        robot.signal(number)
         bridge.wait_for("FAULT: ")
         assert "/joint_states has sent no message for" in bridge.text or "newest reading is" in bridge.text
-        with Peer("ur_driver_standin.py", domain=domain) as back, Node("brain", NetworkConfig(domain=domain)) as node:
-            back.wait_event("ready")
-            side = Side(bridge, node)
+        if number == signal.SIGKILL:
+            back.enter_context(Peer("ur_driver_standin.py", domain=domain)).wait_event("ready")
+        else:
+            robot.signal(signal.SIGCONT)
+        side = Side(bridge, node)
 
-            def goes_on() -> bool:
-                side.send("/emergency_stop/reset", "std_msgs/msg/Empty", {})
-                goal = {"task_id": "after", "target_pose": {"position": {"x": 9.0}, "orientation": {"w": 1.0}}}
-                side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal)
-                return "fault" not in side.ended(1)[-1].message.lower()
+        def goes_on() -> bool:
+            side.send("/emergency_stop/reset", "std_msgs/msg/Empty", {})
+            goal = {"task_id": "after", "target_pose": {"position": {"x": 9.0}, "orientation": {"w": 1.0}}}
+            side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal)
+            return "fault" not in side.ended(1)[-1].message.lower()
 
-            until(goes_on, "goals are taken again")
+        until(goes_on, "goals are taken again")
 
 
 def test_a_robot_that_is_not_there_is_named(domain: int, tmp_path: Path) -> None:

@@ -79,19 +79,6 @@ def test_each_goal_of_a_flood_has_one_result_and_the_stop_is_not_behind_it(base:
     base.reset()
 
 
-def test_each_goal_of_a_burst_to_an_arm_has_one_result(arm: Side) -> None:
-    # Near where the arm stands; the first is followed, eight wait, and the others are refused.
-    pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}
-    names = [f"burst {k}" for k in range(100)]
-    for name in names:
-        arm.send(COMMAND_TOPIC, COMMAND, {"header": {"frame_id": "base"}, "task_id": name, "target_pose": pose})
-    ended = arm.ended(100)
-    assert sorted(one.task_id for one in ended) == sorted(names)
-    assert any("goals wait already" in one.message for one in ended)
-    arm.served.wait_for(f": {COMMAND_TOPIC}: ")  # a refused goal is counted
-    is_at(arm, arm.joints)
-
-
 def test_the_result_of_a_stopped_robot_names_the_topic_that_resets_it(arm: Side) -> None:
     pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0, "w": 0.0}}
     arm.press()
