@@ -1,4 +1,4 @@
-"""A bridge in front of a robot, and a brain, as one launch file: `ros2 launch bridge.launch.py robot:=ur5`.
+"""A bridge in front of a robot, and a brain, as one launch file: `ros2 launch bridge.launch.py`.
 
 `bhd-ros2` is a program of its own environment, not a node of a ROS package: it is started as a process. The parameters
 of a brain are those of its node; those of the bridge are its options.
@@ -15,7 +15,7 @@ def generate_launch_description() -> LaunchDescription:
     robot = LaunchConfiguration("robot")
     return LaunchDescription(
         [
-            DeclareLaunchArgument("robot", default_value="turtlebot3", description="turtlebot3 or ur5"),
+            DeclareLaunchArgument("robot", default_value="turtlebot3", description="ur5, with a brain for arms"),
             ExecuteProcess(
                 cmd=["bhd-ros2", "bridge", ["--robot.type=", robot], "--robot.plant=ros2", "--articles=true"],
                 sigterm_timeout="15",
