@@ -114,8 +114,9 @@ def guard(state: Any, limits: Any) -> bool:
 
     It knows nothing of how it came about: it is for what nobody thought of, such as a trajectory in shared memory that
     another process overwrote. A safe command becomes what is `written`; another continues from there, at a falling
-    speed, for which a safe command leaves room before the end of the range. A position servo's command may always come
-    nearer to where the joint is: that takes torque away.
+    speed, for which a safe command leaves room before the end of the range. Wheels brake meanwhile, for however long
+    there is no safe command; torques stay. A position servo's command may always come nearer to where the joint is:
+    that takes torque away.
 
     Returns:
         Whether the command was safe.
@@ -127,19 +128,17 @@ def guard(state: Any, limits: Any) -> bool:
         # Not if it is no number.
         is_near = -limits.change[k] <= change <= limits.change[k] and limits.lower[k] <= value <= limits.upper[k]
         room = limits.upper[k] - value if change > 0.0 else value - limits.lower[k]
-        is_bent = (
-            abs(change - state.written_rate[k]) > limits.bend[k] or braking_way(abs(change), limits.bend[k]) > room
-        )
+        is_bent = abs(change - state.written_rate[k]) > limits.bend[k]
         if is_bent and (value <= state.position[k] if change > 0.0 else change < 0.0 and value >= state.position[k]):
             is_bent = False
-        is_safe = is_safe and is_near and not is_bent
+        is_safe = is_safe and is_near and not is_bent and not braking_way(abs(change), limits.bend[k]) > room
+    wheels = limits.joints - 2 if limits.is_drive else limits.joints
     for k in range(limits.joints):
         before, value, rate = state.written[k], state.actuators[k], state.written_rate[k]
-        if is_safe:
-            state.written_rate[k] = value - before
-        else:
+        if not is_safe:
             slower = rate - clamp(rate, -limits.bend[k], limits.bend[k])
+            if k >= wheels:  # as hard as a stop does: the change is for that of forward speed and yaw rate at once
+                slower = clamp(-before, -0.5 * limits.change[k], 0.5 * limits.change[k])
             value = clamp(before + slower, limits.lower[k], limits.upper[k])
-            state.written_rate[k] = value - before
-        state.written[k] = value
+        state.written_rate[k], state.written[k] = value - before, value
     return is_safe
