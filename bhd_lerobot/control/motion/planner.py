@@ -125,8 +125,11 @@ class GoalPlanner:
         return Plan(trajectory, trajectory.target.copy())
 
     def brake(self, state: State, *, hard: bool) -> Trajectory:
-        """Return how all dimensions come to rest, with the limits of normal motion or with those of a stop."""
-        trajectory = to_rest(state, self.stop_limits if hard else self._calm, self.hz)
+        """Return how all dimensions come to rest, with the limits of normal motion or with those of a stop.
+
+        Near the end of its range a joint that speeds up may need those of a stop in any case.
+        """
+        trajectory = to_rest(state, self.stop_limits if hard else self._calm, self.hz, self.stop_limits)
         if isinstance(trajectory, PlanFailure) and self._dynamics is not None:
             trajectory = to_rest(state, self.limits, self.hz)  # it was faster than its load permits now
         # A state that nothing can brake is not a state of a reference; what remains is to stand still.

@@ -191,15 +191,18 @@ def to_target(
     return brake.then(second) if isinstance(second, Trajectory) else second
 
 
-def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFailure:
+def to_rest(
+    start: State, limits: MotionLimits, hz: int, brake_limits: MotionLimits | None = None
+) -> Trajectory | PlanFailure:
     """Return the trajectory on which each dimension comes to rest as soon as it can.
 
-    A dimension that cannot come to rest before its position limit overshoots it by as little as its limits allow and
-    comes to rest on it.
+    A dimension that cannot come to rest before its position limit brakes harder, if it may; otherwise it overshoots the
+    limit by as little as its limits allow and comes to rest on it.
 
     Args:
         limits: the limits; those of a stop if it is urgent.
         hz: ticks a second [Hz].
+        brake_limits: the limits to brake with where gentler ones do not suffice; `limits` if None.
     """
     brake = _calculate(start, None, limits, hz, "No")
     if isinstance(brake, PlanFailure) or _stays_within(brake, start, limits):
@@ -207,7 +210,7 @@ def to_rest(start: State, limits: MotionLimits, hz: int) -> Trajectory | PlanFai
     lower, upper = _bounds(start, limits)
     outside = ((brake.position < lower - _SLACK) | (brake.position > upper + _SLACK)).any(axis=0)
     target = np.where(outside, np.clip(brake.target, lower, upper), brake.target)
-    back = _calculate(start, target, limits, hz, "No")
+    back = _calculate(start, target, limits, hz, "No") if brake_limits is None else to_rest(start, brake_limits, hz)
     if isinstance(back, PlanFailure):
         return brake
     pick = np.flatnonzero(outside)

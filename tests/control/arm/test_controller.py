@@ -114,6 +114,27 @@ def test_without_setpoints_the_arm_stops_at_the_time_out_and_holds() -> None:
     rig.check()
 
 
+@pytest.mark.law
+@pytest.mark.parametrize("step", [0.2, 0.5])
+@pytest.mark.parametrize("frames", [1, 3])
+def test_a_stream_that_falls_silent_on_its_way_to_the_end_of_a_range_comes_to_rest_within_it(
+    step: float, frames: int
+) -> None:
+    """Wherever it does: a joint that still speeds up may have no room for a gentle brake."""
+    rig, joints = Rig(24, active=False), [0, 5]
+    rig.plant.position[:, joints] = np.subtract(2 * np.pi, np.linspace(0.05, 0.6, 24))[:, None]
+    for request in (Request.CONFIGURE, Request.ACTIVATE):
+        assert rig.request(request).accepted.all()
+    rig.rows, values = [rig.cerebellum.command.copy()], rig.plant.position.copy()
+    for _ in range(frames):
+        values[:, joints] += step
+        rig.stream(values, 1)
+    rig.tick(TIMEOUT_TICKS + HZ)
+    assert (rig.cerebellum.mode == Mode.HOLD).all()
+    assert (rig.cerebellum.take_flags()[1] == Watchdog.COMMAND_AGE).all()
+    rig.check()
+
+
 def test_a_setpoint_replaces_a_goal() -> None:
     rig = Rig()
     rig.go(**SWEEP)
