@@ -385,6 +385,7 @@ class Frames:
         self._pool: ThreadPoolExecutor | None = None
         self._addresses, self._done, self._zeros = np.zeros((3, world.n), np.int64)
         self._one_tick: Callable[[int, Any], None] | None = None
+        self._made_with: tuple[Any, ...] = ()
         self._now = np.zeros(1, np.int64)
         self._at_once = _NO_RING, self._zeros, self._zeros
         self._checked, self._copies = -1, False
@@ -459,23 +460,24 @@ class Frames:
         return True
 
     def tick(self, now_ns: int) -> bool:
-        """Let one tick of one robot go by, at any time [ns]; `run` has done it before in the same scene.
+        """Let one tick of one robot go by, at any time [ns].
 
         Returns:
-            False if nothing was done, as `run`.
+            False if nothing was done, as `run`; also if there are more robots.
         """
         own, late = self._cerebellum, self._late
-        if self._one_tick is None:
-            if not self._is_ready():
+        is_late = late is not None and late.is_late
+        parts = own.plant, own.fifo, own.estop, is_late, len(self._world.outputs)
+        if self._one_tick is None or parts != self._made_with:
+            if self._world.n > 1 or not self._is_ready():
                 return False
             rest = self._seen_states, self._done, self._now
             arguments = self._threads[0].arguments(self._addresses, self._shared, *rest)
-            self._one_tick = partial(self._kernel.compiled, np.zeros(1, np.intp), *arguments)
+            self._one_tick, self._made_with = partial(self._kernel.compiled, np.zeros(1, np.intp), *arguments), parts
         own.now_ns = self._now[0] = now_ns
         self._done[0] = 0
         if own.controller.arms is not None:
             own.controller.arms["stage"] = 0
-        is_late = late is not None and late.is_late
         while True:
             self._one_tick(*self._varying)
             if self._done[0]:
@@ -506,7 +508,7 @@ class Frames:
         return True
 
     def forget(self) -> None:
-        """Prepare anew before the next `tick`: another scene has begun."""
+        """Prepare anew before the next `tick`: another scene has begun, or fields of models have changed."""
         self._one_tick = None
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.control import kernels
 from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
+from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
@@ -216,25 +217,82 @@ def test_physics_that_diverges_is_found() -> None:
     simulation.close()
 
 
+class Between:
+    """A plant before a plant, which counts what is written."""
+
+    def __init__(self, plant: Any) -> None:
+        self.plant, self.writes = plant, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.plant, name)
+
+    def write(self, ctrl: NDArray[np.float64]) -> None:
+        self.writes += 1
+        self.plant.write(ctrl)
+
+
 @pytest.mark.usefixtures("compiled")
 def test_a_plant_that_is_put_in_between_sees_every_write() -> None:
     simulation = make(1)
-
-    class Between:
-        def __init__(self, plant: Any) -> None:
-            self.plant, self.writes = plant, 0
-
-        def __getattr__(self, name: str) -> Any:
-            return getattr(self.plant, name)
-
-        def write(self, ctrl: NDArray[np.float64]) -> None:
-            self.writes += 1
-            self.plant.write(ctrl)
-
     simulation.cerebellum.plant = between = Between(simulation.plant)  # type: ignore[assignment]
     simulation.step(np.zeros((1, 2)))
     assert between.writes == simulation.rates.ticks_per_frame
     simulation.close()
+
+
+def after(what: str) -> NDArray[np.float64]:
+    """Return what is seen and true of bases in which something comes between two ticks that run alone."""
+    simulation, more = make(2 if what == "another base" else 1), np.zeros(0)
+    first = simulation.physics_state
+
+    def tick(count: int) -> None:
+        for _ in range(count):
+            simulation.run_tick(simulation.bridge.now_ns, 1)
+            simulation.bridge._tick += 1
+
+    simulation.send(np.full((simulation.n, 2), (0.15, 0.5)))
+    tick(20)
+    match what:
+        case "another scene":
+            simulation.reset(np.zeros(1, np.intp), [make_arena("random", 9, robot_radius=0.105)], [9])
+        case "an earlier state":
+            simulation.restore_physics(0, first[0])
+        case "a tick of the world alone":
+            simulation.advance()
+        case "an end":
+            simulation.stop(np.zeros(1, np.intp))
+            tick(5)
+        case "another word of the stop":
+            simulation.cerebellum.estop = EstopWord(1)
+            simulation.estop()
+            tick(5)
+        case "another plant":
+            simulation.cerebellum.plant = between = Between(simulation.plant)  # type: ignore[assignment]
+            tick(5)
+            more = np.array([between.writes])
+        case "one more field that is read":
+            more = simulation.world.derived("xpos")
+            tick(5)
+        case _:
+            tick(5)
+    every = [simulation.observe().state, simulation.physics_state, simulation.modes, more]
+    simulation.close()
+    return np.concatenate([np.ravel(values) for values in every])
+
+
+@pytest.mark.law
+@pytest.mark.usefixtures("compiled")
+@each_case(
+    "what",
+    [
+        *("another scene", "an earlier state", "a tick of the world alone", "an end", "another word of the stop"),
+        *("another plant", "one more field that is read", "another base"),
+    ],
+)
+def test_whatever_comes_between_two_ticks_that_run_alone_it_counts_at_once(what: str) -> None:
+    fast = after(what)
+    with kernels.never_compiled():
+        np.testing.assert_array_equal(fast, after(what))
 
 
 FIELDS = ("xfrc_applied", "qacc_warmstart", "ncon", "xquat", "qfrc_bias", "actuator_force")

@@ -78,7 +78,7 @@ class Simulation(Host):
             part.touches = self._touches[first : (first := first + part.touch_kinds)]
         self._touched = tuple(self._touches)
         states = new_states(n)
-        self._reading, self._is_read = PlantReading(n, self.controller.joints, states=states), False
+        self._reading, self._read_tick = PlantReading(n, self.controller.joints, states=states), -1
         gyro = {"gyro": GYROSCOPE, "beams": config.beams} if body.drive is not None and config.imu else {}
         self._frames = Frames(world, self.cerebellum, self._touches, states, late=plant, brakes=joints.brakes, **gyro)
         self._active: NDArray[np.intp] | None = None
@@ -110,9 +110,9 @@ class Simulation(Host):
 
     def read(self) -> PlantReading:
         """Return the joints as they are now."""
-        if not self._is_read:
+        if self._read_tick != self.tick:
             self.plant.read(self._reading)
-        self._is_read = False  # whatever comes next may move them
+        self._read_tick = -1  # whatever comes next may move them
         return self._reading
 
     @property
@@ -128,6 +128,7 @@ class Simulation(Host):
         for part in reversed(self.parts):  # an arm's objects stand on what is in the arena
             part.place(ids, scenes)
         self._touches[:, ids] = False
+        self._read_tick = -1
         self._frames.forget()
 
     def privileged_state(self) -> NDArray[np.float64]:
@@ -212,6 +213,7 @@ class Simulation(Host):
         nq = self.world.qpos.shape[1]
         self.world.qpos[sim], self.world.qvel[sim] = state[:nq], state[nq:]
         self.world.forward(np.array([sim]))
+        self._read_tick = -1
 
     @property
     def not_in_state(self) -> tuple[str, ...]:
@@ -243,12 +245,12 @@ class Simulation(Host):
 
     def run_tick(self, now_ns: int, ticks: int) -> None:
         """Run one tick of control, and let the world go on by some, see `Host.run_tick`."""
-        if not (self._is_plain and self._frames.tick(now_ns)):
+        if not (self._is_plain and self._active is None and self._frames.tick(now_ns)):
             super().run_tick(now_ns, ticks)
             return
         self.tick += 1
         self._after_tick()
-        self._is_read = ticks == 1
+        self._read_tick = self.tick
         for _ in range(ticks - 1):
             self.advance()
 
