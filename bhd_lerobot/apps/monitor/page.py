@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -75,10 +75,11 @@ async def _stream(request: web.Request, live: LivePage, end: asyncio.Event) -> w
     response = web.StreamResponse(headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store"})
     await response.prepare(request)
     seen = -1
-    while not end.is_set():
-        seen, message = live.message(seen)
-        await response.write(f"data: {to_json(message)}\n\n".encode())
-        await asyncio.sleep(_PERIOD_S)
+    with suppress(ConnectionResetError):  # the page was closed
+        while not end.is_set():
+            seen, message = live.message(seen)
+            await response.write(f"data: {to_json(message)}\n\n".encode())
+            await asyncio.sleep(_PERIOD_S)
     return response
 
 

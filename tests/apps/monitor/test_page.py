@@ -200,6 +200,17 @@ def test_who_does_not_read_holds_up_nobody(robot: Robot, watched: Any) -> None:
     assert robot.block.words[Word.PHASE] == Phase.RUNNING
 
 
+def test_a_page_that_is_closed_is_no_error(robot: Robot, watched: Any, caplog: pytest.LogCaptureFixture) -> None:
+    with served(watched(robot), 0) as address:
+        with closing(Stream(address)) as stream:
+            stream.next()
+        stream.answer.close()
+        with closing(Stream(address)) as other:
+            for _ in range(30):
+                other.next()
+    assert [record.getMessage() for record in caplog.records] == []
+
+
 def test_a_scene_that_is_too_long_is_left_out(robot: Robot, watched: Any) -> None:
     robot.block.publish_scene(json.dumps(["x" * 40_000]))
     count, text = watched(robot).scene
