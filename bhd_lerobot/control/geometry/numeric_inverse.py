@@ -85,7 +85,8 @@ class NumericInverse:
             Postures of shape (k, dof), and what each is off by, shape (k, 3): a distance [m], an angle [rad], and the
             root of the squared differences of the axes' directions, each counted as above [1].
         """
-        target, found, off = np.ascontiguousarray(pose[:3]), starts.copy(), np.empty((len(starts), 3))
+        target, posture = np.ascontiguousarray(pose[:3]), np.ascontiguousarray(posture)
+        found, off = starts.copy(), np.empty((len(starts), 3))
         lower, upper = (self._lower, self._upper) if limited else (self._unlimited[0], self._unlimited[1])
         room, tool = np.zeros((2 * JOINTS + 3, JOINTS)), np.zeros((3, 4))  # new ones: threads may share the arm
         arm, geometry, find = np.zeros(1, ARM), self._geometry, find_posture.function

@@ -57,6 +57,17 @@ def off(kinematics: ForwardKinematics, q: Array, pose: Array) -> tuple[float, fl
     return float(np.linalg.norm(tool[:3, 3] - pose[:3, 3])), float(turn)
 
 
+def test_a_line_begins_at_a_posture_whatever_array_that_is_a_part_of() -> None:
+    """The end of a brake is a row of a trajectory whose columns are joints."""
+    kinematics = arm(6)
+    assert find_posture.compiled
+    (start,) = postures(kinematics, 1)
+    poses = np.stack([kinematics.tool(start)] * 3)
+    part = np.repeat(start, 2)[::2]
+    assert not part.flags.c_contiguous
+    np.testing.assert_array_equal(kinematics.line(poses, part).postures, kinematics.line(poses, start).postures)
+
+
 @pytest.mark.law
 @pytest.mark.parametrize("joints", [4, 5, 6, 7])
 def test_the_pose_of_every_posture_is_reached_from_anywhere(joints: int) -> None:
