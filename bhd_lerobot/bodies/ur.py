@@ -381,7 +381,7 @@ def ur(
         least_physics_hz=math.ceil(model.damping[5] / (4 * joints[5].rotor)),
         # At less, a joint at full speed is farther from its reference than `blocked_rad` for a tick; by torques, the
         # observer of the contact is faster than a tick.
-        least_control_hz=25 if actuation == "position" else 50,
+        least_control_hz=math.ceil(25 * max(model.speeds) / 180.0) if actuation == "position" else 50,
     )
 
 

@@ -21,6 +21,7 @@ from bhd_lerobot.robots.config import BhdRobotConfig
 
 _DEVICE_PLANT = "bhd_lerobot.robots.device.plant:DevicePlant"
 _DEVICE_TIMEOUT_S = 0.1  # a serial bus repeats what was lost
+_FARTHEST = 1000.0  # [m] of an obstacle: of far larger numbers the squares are infinite, and distances no numbers
 
 
 @dataclass
@@ -96,10 +97,10 @@ class ArmConfig(BhdRobotConfig):
                 "an impedance is commanded by tool poses: use --robot.action_space=tool."
             )
         for number, values in enumerate(self.obstacles):
-            if len(values) != 7 or not np.isfinite(values).all() or not values[6] > 0:
+            if len(values) != 7 or not np.abs(values).max() <= _FARTHEST or not values[6] > 0:
                 raise ConfigError(
-                    f"robot.obstacles has {values} as number {number}; an obstacle is 7 finite numbers [m]: x, y, z of "
-                    "one end, x, y, z of the other, and the radius, which is positive."
+                    f"robot.obstacles has {values} as number {number}; an obstacle is 7 numbers of at most "
+                    f"{_FARTHEST:g} m: x, y, z of one end, x, y, z of the other, and the radius, which is positive."
                 )
         self.check_rates()
 

@@ -230,8 +230,8 @@ def test_setpoints_and_goals_keep_away_from_obstacles_that_are_declared() -> Non
     (result,) = results[0]
     assert result.code == ResultCode.SELF_COLLISION
     assert "of obstacle_0; 0.005 m is the least" in result.message
-    for wrong in ([0.1] * 6, [0.1] * 6 + [0.0], [float("nan")] + [0.1] * 6):
-        with pytest.raises(ConfigError, match=r"robot.obstacles has .* as number 0; an obstacle is 7 finite numbers"):
+    for wrong in ([0.1] * 6, [0.1] * 6 + [0.0], [float("nan")] + [0.1] * 6, [1e200] + [0.1] * 6):
+        with pytest.raises(ConfigError, match=r"robot.obstacles has .* as number 0; an obstacle is 7 numbers"):
             UR5Config(obstacles=[wrong])
 
 

@@ -1,10 +1,14 @@
 """A UR5 at other rates than its own: it moves freely without an alarm, and stops where it presses."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.tabletop import TableScene
+from bhd_lerobot.bodies.ur import MODELS, ur
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError
@@ -40,6 +44,26 @@ def test_at_any_rates_free_goals_succeed_and_press_on_nothing(control_hz: int, p
         codes += [result.code for results in report.results.values() for result in results]
     assert codes == [ResultCode.SUCCEEDED] * POSTURES
     assert most < MOST_FREE_N
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_at_the_lowest_rate_the_last_joint_turns_at_full_speed_without_an_alarm(name: str) -> None:
+    body = ur(name)
+    hz = body.least_control_hz
+    config: Any = RobotConfig.get_choice_class(name)
+    arm = Simulation(config(control_hz=hz, physics_hz=10 * hz, fps=25), 1, threads=1)
+    arm.reset(np.arange(1), [TableScene("empty", (), arm.body.arm.home)], [0])
+    posture = np.array(arm.body.arm.home[:6])
+    posture[5] += 5.5
+    assert arm.controller.submit(0, BrainCommand("fast", joint_target=tuple(posture))) is None
+    codes, most = [], 0.0
+    while not codes:
+        report = arm.step(None)
+        assert not report.watchdog.any()
+        most = max(most, float(arm.controller.velocity[0, 5]))
+        codes = [result.code for results in report.results.values() for result in results]
+    assert codes == [ResultCode.SUCCEEDED]
+    assert most > 0.99 * body.limits.velocity[5]
 
 
 @pytest.mark.thorough(but=2)

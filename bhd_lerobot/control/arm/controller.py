@@ -36,6 +36,7 @@ _GIVES = 0.5  # the least share of its largest torque that the servo of a blocke
 _ARRIVED_RAD = 2e-4  # [rad]
 _TINY = 1e-9
 _STANDS = 0.01  # [rad, m] a joint that moved by less has not moved
+_LOOK_S = 0.02  # between two checks of clearance at the most, however long a frame is: an arm turns aside meanwhile
 _LOST = (
     "The efforts that the plant reads are 0 while the motors carry the arm: they are not measured, and without them "
     "there is no limit of force. Repair them, or let the plant leave PlantReading.has_effort false."
@@ -140,7 +141,7 @@ class ArmController(Controller):
     def _put_limits(self, limits: Any, control_hz: int, frame_ticks: int) -> None:
         """Write what clearance, servos and stops go by."""
         row, arm, dof = self._limits, self.arm, self._dof
-        row["look_ticks"] = max(1, frame_ticks // LOOKS)
+        row["look_ticks"] = max(1, min(frame_ticks // LOOKS, round(_LOOK_S * control_hz)))
         row["look_s"], row["least"] = row["look_ticks"] / control_hz, arm.chain.min_distance
         acceleration = np.asarray(limits.acceleration[:dof])
         # A brake that changes its acceleration gradually begins so much later; what speeds an arm up ends first.
