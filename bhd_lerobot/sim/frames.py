@@ -371,6 +371,9 @@ class Frames:
         servos |= {} if world.body.drive is None else self._place_drive(row)
         row["gyro"], row["beams"] = -1 if gyro is None else model.sensor(gyro).adr[0], beams
         row["is_exact"] = efforts.is_exact
+        if efforts.is_exact or row["substeps"] > 1:
+            for name in ("actuator_force", "actuator_velocity"):  # that a step in Python after these averages by
+                world.derived(name)
         row["most_force"] = row["most_torque"] = np.inf
         # Others' efforts are averaged in Python.
         self._is_possible = efforts.are_all(list(servos.values()))

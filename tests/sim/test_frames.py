@@ -242,7 +242,7 @@ def test_a_plant_that_is_put_in_between_sees_every_write() -> None:
 
 def after(what: str) -> NDArray[np.float64]:
     """Return what is seen and true of bases in which something comes between two ticks that run alone."""
-    simulation, more = make(2 if what == "another base" else 1), np.zeros(0)
+    simulation, more = make(2 if what == "another base" else 1, physics_hz=600), np.zeros(0)
     first = simulation.physics_state
 
     def tick(count: int) -> None:
@@ -259,6 +259,10 @@ def after(what: str) -> NDArray[np.float64]:
             simulation.restore_physics(0, first[0])
         case "a tick of the world alone":
             simulation.advance()
+        case "ticks that are skipped":
+            simulation.run_tick(simulation.bridge.now_ns, 2)
+            simulation.bridge._tick += 2
+            tick(1)
         case "an end":
             simulation.stop(np.zeros(1, np.intp))
             tick(5)
@@ -275,7 +279,8 @@ def after(what: str) -> NDArray[np.float64]:
             tick(5)
         case _:
             tick(5)
-    every = [simulation.observe().state, simulation.physics_state, simulation.modes, more]
+    efforts = simulation.cerebellum.states["effort"]
+    every = [simulation.observe().state, simulation.physics_state, simulation.modes, efforts, more]
     simulation.close()
     return np.concatenate([np.ravel(values) for values in every])
 
@@ -285,8 +290,8 @@ def after(what: str) -> NDArray[np.float64]:
 @each_case(
     "what",
     [
-        *("another scene", "an earlier state", "a tick of the world alone", "an end", "another word of the stop"),
-        *("another plant", "one more field that is read", "another base"),
+        *("another scene", "an earlier state", "a tick of the world alone", "ticks that are skipped", "an end"),
+        *("another word of the stop", "another plant", "one more field that is read", "another base"),
     ],
 )
 def test_whatever_comes_between_two_ticks_that_run_alone_it_counts_at_once(what: str) -> None:
