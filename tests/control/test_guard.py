@@ -1,7 +1,10 @@
 """Whatever is asked for, the guard's own answers keep the limits of the wire, to the end of a range and back."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
@@ -12,17 +15,23 @@ from bhd_lerobot.control.record import LIMITS, new_states, put
 TICKS, RANGE, CHANGE, HZ = 400, 1.0, 0.04, 500
 
 
+def joints(bend: float) -> tuple[NDArray, Any, Any]:
+    """Return the record of a robot with two joints, as an array and as the guard takes it, and its limits."""
+    states, numbers = new_states(1), np.zeros(1, LIMITS)
+    numbers["joints"] = 2
+    for name, most in (("lower", -RANGE), ("upper", RANGE), ("change", CHANGE), ("bend", bend)):
+        put(numbers, name, np.full((1, 2), most))
+    [state], [limits] = kernels.as_objects(states), kernels.as_objects(numbers)
+    return states, state, limits
+
+
 @pytest.mark.law
 @pytest.mark.parametrize("bend", [0.001, 0.0037, 0.04, np.inf])
 @pytest.mark.parametrize("seed", range(4))
 def test_no_stream_of_commands_brings_the_wire_beyond_its_limits(bend: float, seed: int) -> None:
     """The stream is the fastest that each tick lets through, with jumps and numbers that are none now and then."""
     rng = np.random.default_rng(seed)
-    states, numbers = new_states(1), np.zeros(1, LIMITS)
-    numbers["joints"] = 2
-    for name, most in (("lower", -RANGE), ("upper", RANGE), ("change", CHANGE), ("bend", bend)):
-        put(numbers, name, np.full((1, 2), most))
-    [state], [limits] = kernels.as_objects(states), kernels.as_objects(numbers)
+    _, state, limits = joints(bend)
     written, kept = np.zeros((TICKS, 2)), np.zeros(TICKS, np.bool_)
     towards = np.ones(2)
     for tick in range(TICKS):
@@ -48,11 +57,7 @@ def test_no_stream_of_commands_brings_the_wire_beyond_its_limits(bend: float, se
 def test_when_no_command_is_safe_any_more_positions_come_to_rest_within_their_limits(bend: float, seed: int) -> None:
     """Also from commands that come nearer to where the joints are, wherever that is, which may bend as they like."""
     rng = np.random.default_rng(seed)
-    states, numbers = new_states(1), np.zeros(1, LIMITS)
-    numbers["joints"] = 2
-    for name, most in (("lower", -RANGE), ("upper", RANGE), ("change", CHANGE), ("bend", bend)):
-        put(numbers, name, np.full((1, 2), most))
-    [state], [limits] = kernels.as_objects(states), kernels.as_objects(numbers)
+    states, state, limits = joints(bend)
     jumps = 0
     for tick in range(TICKS):
         if tick % 20 == 0:
