@@ -93,6 +93,9 @@ class PerceptionConfig(TrainedConfig):
                 raise ConfigError(f"policy.{name} is {values}; it must be {count} finite numbers [m].")
         if self.area and not (self.area[0] < self.area[2] and self.area[1] < self.area[3]):
             raise ConfigError(f"policy.area is {self.area}; it must be smallest x, smallest y, largest x, largest y.")
+        self._check_view()
+
+    def _check_view(self) -> None:
         position, target = self.camera_position, self.camera_target
         if position and (position[2] <= 0.0 or position[:2] == target[:2]):
             raise ConfigError(
@@ -113,6 +116,7 @@ class PerceptionConfig(TrainedConfig):
         self.area = self.area or [*low, *high]
         self.scale = self.scale or workspace.handling.scale
         self.object_height = self.object_height or _TALLEST * self.scale
+        self._check_view()  # one of the two may have been said
 
     def settle(self) -> None:
         """Take what nobody said from a UR5's, and check that the camera sees the table."""

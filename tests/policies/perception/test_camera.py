@@ -12,7 +12,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.tabletop import SCENE_CAMERA, TableObject, TableScene, scene_camera
 from bhd_lerobot.bodies.ur import ur5
-from bhd_lerobot.errors import RenderingError
+from bhd_lerobot.errors import ConfigError, RenderingError
 from bhd_lerobot.policies.perception.camera import Projection
 from bhd_lerobot.policies.perception.configuration_perception import PerceptionConfig
 from bhd_lerobot.robots.config_arm import SO101Config
@@ -94,3 +94,10 @@ def test_the_camera_beside_a_ur5_is_where_it_always_was() -> None:
     config = PerceptionConfig()
     config.stand_before(ur5().need(Arm).workspace)
     assert (config.area, config.object_height, config.scale) == ([0.35, -0.30, 0.65, 0.30], 0.13, 1.0)
+
+
+@pytest.mark.parametrize("said", [{"camera_position": [0.37, 0.02, 1.0]}, {"camera_target": [1.22, -0.62, 0.1]}])
+def test_a_camera_of_which_half_is_said_does_not_look_straight_down(said: dict[str, list[float]]) -> None:
+    config = PerceptionConfig(**said)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="not look straight down"):
+        config.settle()
