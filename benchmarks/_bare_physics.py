@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.control.kernels import never_compiled
+from bhd_lerobot.control.kernels import plain_python
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -47,7 +47,7 @@ def write_down(task: str, actions: np.ndarray, frames: int) -> tuple[list[Entry]
     scan = lidar.scan
     lidar.scan = lambda rngs, ids: (log.append((SCAN, ids.copy())), scan(rngs, ids))[1]
     env.reset(seed=0)
-    with never_compiled():  # in compiled frames no steps are asked for one by one
+    with plain_python():  # in compiled frames no steps are asked for one by one
         for frame in range(frames):
             env.step(actions[frame % len(actions)])
     state = world.qpos.copy()

@@ -26,7 +26,7 @@ from bhd_lerobot.control.messages import (
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
-from bhd_lerobot.control.record import JOINTS, new_states, put
+from bhd_lerobot.control.record import JOINTS, Robots, new_states, put
 from bhd_lerobot.control.tick import drop_all, judge_all, report, tick_arms, tick_bases, tick_mobile_arms, tick_springs
 from bhd_lerobot.errors import ConfigError
 
@@ -55,7 +55,6 @@ class Cerebellum:
         fifo: where commands come from; a new one if None.
         estop: the word of the emergency stop, which any process may press; a new one if None.
         sensors: number of values that the plant reads beside those of the joints.
-        is_framed: whether whole frames in machine code are run in the place of its ticks, if that is possible.
 
     Attributes:
         states: the records of the robots, shape (n,): see `record`.
@@ -79,7 +78,6 @@ class Cerebellum:
         fifo: CommandFifo | None = None,
         estop: EstopWord | None = None,
         sensors: int = 0,
-        is_framed: bool = False,
     ) -> None:
         self.body, self.plant, self.control_hz = body, plant, control_hz
         self.n = n = plant.n
@@ -117,23 +115,29 @@ class Cerebellum:
         self._timeout_ns = round(body.limits.command_timeout_s * NANOSECONDS)
         numbers["timeout_ns"], numbers["width"], numbers["has_sensors"] = self._timeout_ns, width, sensors > 0
         self.now_ns = 0
-        self.may_write, self._is_framed = False, is_framed
+        self.may_write = False
         self._dropped = np.zeros(n, np.int64)
         self._fifo = CommandFifo(n, width) if fifo is None else fifo
         self._estop = EstopWord(n) if estop is None else estop
-        self._bind()
+        self._tick_all = tick_bases if controller.springs is None else tick_springs
+        if controller.arms is not None:
+            self._tick_all = tick_arms if controller.monitors is None else tick_mobile_arms
         self._start_writing(np.arange(n))
 
-    def _bind(self) -> None:
-        states, queues, words = self.states, self.fifo.queues, self.estop.words
-        own, records, sensors_ns = self.controller, (states, queues, words), self.reading.sensors_ns
-        kind = tick_bases if own.springs is None else tick_springs
-        if own.arms is not None:
-            kind = tick_arms if own.monitors is None else tick_mobile_arms
-        parts = own.monitors, own.arms, own.springs, self.numbers, own.arm_limits, own.geometries
-        self._run = kind.bind(*records, *parts, self.reading.sensors, sensors_ns, is_spare=self._is_framed)
-        self._judge = judge_all.bind(states, self.numbers)
-        self._drop_all = drop_all.bind(states, queues, self._dropped)
+    @property
+    def robots(self) -> Robots:
+        """What ticks work on, as kernels take it."""
+        queues, words, reading = self._fifo.queues, self._estop.words, self.reading
+        return Robots(self.states, queues, words, self.numbers, reading.sensors, reading.sensors_ns)
+
+    def load(self, *, with_ticks: bool = True) -> None:
+        """Load the machine code of its calls, which is compiled if the cache has none, before a loop begins.
+
+        Args:
+            with_ticks: also that of `tick`.
+        """
+        for one in (judge_all, drop_all, *([self._tick_all] if with_ticks else ())):
+            one.load()
 
     @property
     def fifo(self) -> CommandFifo:
@@ -144,7 +148,6 @@ class Cerebellum:
     def fifo(self, fifo: CommandFifo) -> None:
         self._fifo = fifo
         self.states["seen_head"] = -1
-        self._bind()
 
     @property
     def estop(self) -> EstopWord:
@@ -154,7 +157,6 @@ class Cerebellum:
     @estop.setter
     def estop(self, estop: EstopWord) -> None:
         self._estop = estop
-        self._bind()
 
     @property
     def stamp_origin_ns(self) -> int:
@@ -192,8 +194,8 @@ class Cerebellum:
     def _tick(self, now_ns: int) -> None:
         self.now_ns = now_ns
         self._read()
-        goes_on = False
-        while not self._run(self.controller.rows, now_ns, goes_on):
+        robots, own, goes_on = self.robots, self.controller, False
+        while not self._tick_all.run(robots, *own.parts, now_ns, goes_on):
             self.serve()
             goes_on = True
         if np.count_nonzero(self._mode_is_new):
@@ -228,7 +230,7 @@ class Cerebellum:
 
     def _drop(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Drop what waits for some robots; return how many commands of each that were, shape (n,)."""
-        self._drop_all(mask)
+        drop_all.run(self.states, self._fifo.queues, self._dropped, mask)
         return self._dropped
 
     def interrupt(self, cause: Watchdog, mode: Mode) -> None:
@@ -373,7 +375,7 @@ class Cerebellum:
         for name, values in kept.items():
             self.states[name][others] = values  # theirs are of the last tick
         self.readings.forget(np.flatnonzero(mask))
-        self._judge(mask)
+        judge_all.run(self.states, self.numbers, mask)
         self._tell_controller()
 
     def restart(self, ids: NDArray[np.intp]) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.record import LIMITS, new_states
+from bhd_lerobot.control.record import LIMITS, Arms, Springs, new_states
 
 
 class Controller(ABC):
@@ -76,6 +76,12 @@ class Controller(ABC):
     def rows(self) -> Any:
         """The trajectories that arms play, shape (T, 3, width); None of other robots."""
         return None
+
+    @property
+    def parts(self) -> tuple[Any, Arms | None, Springs | None]:
+        """The records of its drives' monitors, of its arms and of its impedances, as ticks take them."""
+        arms = None if self.arms is None else Arms(self.arms, self.arm_limits, self.geometries, self.rows)
+        return self.monitors, arms, None if self.springs is None else Springs(self.springs, self.arm_limits)
 
     @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:

@@ -329,7 +329,6 @@ class BaseController(Controller):
         metres = drive.wheel_radius / numbers["counts"]  # that a wheel rolls in one encoder count
         numbers["per_count"], numbers["yaw_per_count"] = metres / 2, metres / drive.wheel_separation
         numbers["period_ticks"], numbers["late"], numbers["gyro"] = period, late, -1 if gyro is None else gyro
-        self._read_odometry = read_odometry.bind(states, self.numbers)
 
     @property
     def _turn(self) -> float:
@@ -387,7 +386,7 @@ class BaseController(Controller):
             angles: wheel angles [rad], shape (n, 2).
         """
         out = np.empty((len(angles), 3))
-        self._read_odometry(angles, out)
+        read_odometry.run(self.states, self.numbers, angles, out)
         return out
 
 

@@ -1,14 +1,11 @@
-"""Loops over simulations in plain scalar Python, and the machine code that numba makes of them once it is worth it.
+"""Functions over numbers, arrays and records in plain scalar Python, which numba compiles when they are first run.
 
-To load numba and its code takes as long as some 5,000 ticks in Python: what is short
-runs as it stands, as everything does with NUMBA_DISABLE_JIT=1. The results are the same bits.
+With NUMBA_DISABLE_JIT=1 they run as they stand, for a debugger. The results are the same bits.
 """
 
 import hashlib
-import math
 import os
 import platform
-import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -22,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_values: float = 40_000  # that a loop handles in Python, until it is compiled
+_is_plain = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 _LOCK = RLock()  # numba's cache folder is set for the whole process
 # The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
 _CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
@@ -38,32 +35,53 @@ def record(name: str, fields: list[Any]) -> np.dtype[Any]:
     return RECORDS[name]
 
 
-class Kernel[**P, R]:
-    """A function of numbers, arrays and records; other kernels may call it.
+TUPLES: dict[str, type[tuple[Any, ...]]] = {}
+"""Named tuples that signatures name."""
 
-    Called as it is, it runs as plain Python. An array of records is a list of objects then, see `as_objects`.
+
+def group[T: type[tuple[Any, ...]]](kind: T) -> T:
+    """Let signatures name a named tuple of arguments, with the types of its fields in brackets."""
+    TUPLES[kind.__name__] = kind
+    return kind
+
+
+class Kernel[**P, R]:
+    """A function of numbers, arrays, records and groups of them; other kernels may call it.
+
+    Called as it is, it is plain Python. An array of records is a list of objects then, see `as_objects`.
 
     Args:
         function: the function.
-        signature: the types of its arguments, in numba's words and those of `RECORDS`; empty for what only other
-            kernels call.
-        work: number of values that a record counts for.
+        signature: the types of its arguments, in numba's words and those of `RECORDS` and `TUPLES`; empty for what only
+            other kernels call.
     """
 
-    def __init__(self, function: Callable[P, R], signature: str, work: int = 8) -> None:
-        self.function, self.signature, self.work = function, signature, work
+    def __init__(self, function: Callable[P, R], signature: str) -> None:
+        self.function, self.signature = function, signature
         update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:  # noqa: D102
         return self.function(*args, **kwargs)
 
-    def of(self, name: str, signature: str, work: int = 8) -> "Kernel[P, R]":
+    def of(self, name: str, signature: str) -> "Kernel[P, R]":
         """Return the kernel of the same function for other types, such as None in the place of a record."""
         code, names = self.function.__code__, self.function.__globals__
         copy: Any = FunctionType(code, names, name, self.function.__defaults__, self.function.__closure__)
         copy.__qualname__ = name  # by which its machine code is found again
         copy.__doc__, copy.__module__ = self.function.__doc__, self.function.__module__
-        return Kernel(copy, signature, work)
+        return Kernel(copy, signature)
+
+    def run(self, *arguments: Any) -> R:
+        """Run the machine code, or plain Python where nothing is to be compiled."""
+        if _is_plain:
+            python: Callable[..., R] = self.function
+            return python(*map(as_objects, arguments))
+        return self.compiled(*arguments)
+
+    def load(self) -> None:
+        """Compile it now, or load it, and not when it is first run: before a loop on the wall clock begins."""
+        if not _is_plain:
+            _ = self.compiled
 
     @cached_property
     def compiled(self) -> Callable[..., R]:
@@ -73,8 +91,6 @@ class Kernel[**P, R]:
         config: Any = numba.config
         if not self.signature:
             return numba.njit(error_model="numpy")(self.function)
-        if config.DISABLE_JIT:
-            return self._plain
         with _LOCK:
             return self._compile(numba, config)
 
@@ -83,7 +99,8 @@ class Kernel[**P, R]:
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
-        names = {name: numba.from_dtype(dtype) for name, dtype in RECORDS.items()}
+        names: dict[str, Any] = {name: numba.from_dtype(dtype) for name, dtype in RECORDS.items()}
+        names |= {name: partial(_tuple_type, kind) for name, kind in TUPLES.items()}
         signature = eval(self.signature, {}, {**vars(numba.types), **names})  # as numba does
         options: Any = {"error_model": "numpy", "nogil": True}
         try:
@@ -93,67 +110,16 @@ class Kernel[**P, R]:
         finally:
             config.CACHE_DIR = before
 
-    def _plain(self, *arguments: Any) -> Any:
-        python: Callable[..., Any] = self.function
-        return python(*map(as_objects, arguments))
-
-    def handles(self, array: NDArray) -> int:
-        """Return how many values a loop over an array handles; a record stands for many."""
-        return array.size * self.work if array.dtype.names else array.size
-
-    def bind(self, *bound: Any, is_spare: bool = False) -> Callable[..., R]:
-        """Return this kernel with its first arguments, to be called with the others.
-
-        It is compiled once it has handled `_values` values of its very first argument; a spare one, which may never be
-        called, not before its first call.
-        """
-        self._check(0, bound)
-        if (not _values and not is_spare) or (_values < math.inf and "compiled" in vars(self)):  # by another one
-            return partial(self.compiled, *bound)
-        left, is_checked = _values, False
-        python: Callable[..., R] = self.function
-        machine: Callable[..., R] | None = None
-        plain: list[Any] = []
-
-        def call(*arguments: Any) -> R:
-            nonlocal left, is_checked, machine, plain
-            if machine is not None:
-                return machine(*arguments)
-            left -= self.handles(bound[0] if bound else arguments[0])
-            if left < 0:
-                machine = partial(self.compiled, *bound)
-                return machine(*arguments)
-            if not is_checked:
-                self._check(len(bound), arguments)
-                is_checked, plain = True, [as_objects(value) for value in bound]
-            return python(*plain, *arguments)
-
-        return call
-
-    @cached_property
-    def arrays(self) -> list[tuple[np.dtype[Any], int, bool] | None]:
-        """Type, dimensions and whether it must be C-contiguous of each argument; None for a number."""
-        kinds = re.findall(r"(\w+)(\[[^\]]*\])?", self.signature.partition("(")[2])
-        types = [RECORDS[name] if name in RECORDS else np.dtype(name) if shape else None for name, shape in kinds]
-        shapes = [(shape.count(",") + 1, "::1" in shape) for _, shape in kinds]
-        return [None if kind is None else (kind, *shape) for kind, shape in zip(types, shapes, strict=True)]
-
-    def _check(self, first: int, arguments: tuple[Any, ...]) -> None:
-        """Refuse what the machine code would refuse."""
-        for at, argument in enumerate(arguments, first):
-            kind = self.arrays[at]
-            if kind and not (
-                argument.dtype == kind[0] and argument.ndim == kind[1] and (argument.flags.c_contiguous or not kind[2])
-            ):
-                raise TypeError(
-                    f"Argument {at} of {self.function.__name__} is an array of {argument.dtype} of shape "
-                    f"{argument.shape}; its types are {self.signature}."
-                )
-
     @property
     def _numba_type_(self) -> Any:
         """What numba takes it for inside of other kernels."""
         return self.compiled._numba_type_  # type: ignore[attr-defined]
+
+
+def _tuple_type(kind: type[tuple[Any, ...]], *fields: Any) -> Any:
+    from numba import types
+
+    return types.BaseTuple.from_types(fields, kind)
 
 
 class Fence:
@@ -224,8 +190,10 @@ fence = Fence(platform.machine())
 def as_objects(array: Any) -> Any:
     """Return an array of records as a list of objects with their fields, as plain Python reads them; others as it is.
 
-    A number is a number, and an array a view.
+    Of a named tuple each field. A number is a number, and an array a view.
     """
+    if type(array) in TUPLES.values():
+        return type(array)(*map(as_objects, array))
     if not (isinstance(array, np.ndarray) and array.dtype.names):
         return array
     kind = _object_type(array.dtype)
@@ -254,38 +222,25 @@ def _object_type(dtype: np.dtype[Any]) -> Callable[[NDArray], Any]:
     return type("Record", (), body)
 
 
-def is_worth_compiling(one: Kernel[..., Any], handled: int) -> bool:
-    """Return whether a loop that has handled so many values in Python should be compiled, or is already."""
-    if "compiled" in vars(one) and _values < math.inf:
-        return True
-    if handled < _values:
-        return False
-    import numba
-
-    config: Any = numba.config
-    return not config.DISABLE_JIT
-
-
-def compile_at_once() -> None:
-    """Compile kernels from now on when they are bound, not in the middle of a run: for a loop on the wall clock."""
-    global _values  # noqa: PLW0603
-    _values = 0
+def is_plain() -> bool:
+    """Return whether kernels run as plain Python."""
+    return _is_plain
 
 
 @contextmanager
-def never_compiled() -> Iterator[None]:
-    """Bind kernels that stay Python: where a loop on the wall clock is running already."""
-    global _values  # noqa: PLW0603
-    before, _values = _values, math.inf
+def plain_python() -> Iterator[None]:
+    """Run kernels as plain Python inside of this, as with NUMBA_DISABLE_JIT=1; others may take their place then."""
+    global _is_plain  # noqa: PLW0603
+    before, _is_plain = _is_plain, True
     try:
         yield
     finally:
-        _values = before
+        _is_plain = before
 
 
-def kernel[**P, R](signature: str = "", work: int = 8) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+def kernel[**P, R](signature: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]:
     """Make a kernel of a function, see `Kernel`."""
-    return lambda function: Kernel(function, signature, work)
+    return lambda function: Kernel(function, signature)
 
 
 @cache

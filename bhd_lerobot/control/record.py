@@ -4,12 +4,12 @@ In lockstep a robot is a row of an array of records. Their size is fixed, so tha
 robot; values beyond the robot's own joints stay 0.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.kernels import record
+from bhd_lerobot.control.kernels import group, record
 from bhd_lerobot.control.messages import Mode, Reason
 from bhd_lerobot.errors import ConfigError
 
@@ -461,6 +461,57 @@ GEOMETRY = record(
         ("reach", *_vector),
     ],
 )
+
+
+@group
+class Robots(NamedTuple):
+    """What ticks of n robots need, whatever parts they have.
+
+    Attributes:
+        states: their records, shape (n,).
+        queues: their commands, shape (n,).
+        estop: the words of their emergency stops, shape (3, n), see `EstopWord`.
+        limits: the numbers of their body, shape (1,).
+        sensors: further values that their plant measures, shape (n, sensors).
+        sensors_ns: when the oldest of each robot's was measured [ns], shape (n,).
+    """
+
+    states: Any
+    queues: Any
+    estop: NDArray[np.int64]
+    limits: Any
+    sensors: NDArray[np.float64]
+    sensors_ns: NDArray[np.int64]
+
+
+@group
+class Arms(NamedTuple):
+    """What ticks need of arms with position servos.
+
+    Attributes:
+        records: shape (n,).
+        limits: the numbers of their body, shape (1,).
+        geometries: what they are kept clear with, see `bhd_lerobot.control.arm.clearance`.
+        rows: the trajectories that they play, shape (T, 3, width).
+    """
+
+    records: Any
+    limits: Any
+    geometries: Any
+    rows: NDArray[np.float64]
+
+
+@group
+class Springs(NamedTuple):
+    """What ticks need of arms with torque motors.
+
+    Attributes:
+        records: those of their impedances, shape (n,).
+        limits: the numbers of their body, shape (1,).
+    """
+
+    records: Any
+    limits: Any
 
 
 def new_states(n: int) -> NDArray:

@@ -19,7 +19,7 @@ from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.messages import HORIZON_NS, SEQUENCE_STEP, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.plant import SafetyStatus
 from bhd_lerobot.control.reading_check import LARGEST, are_motions_wrong, are_positions_wrong, is_time_wrong
-from bhd_lerobot.control.record import NEVER
+from bhd_lerobot.control.record import NEVER, Arms, Robots, Springs
 
 _HOLD, _TRACKING, _STOPPING, _SAFE_OFF = (int(Mode[name]) for name in ("HOLD", "TRACKING", "STOPPING", "SAFE_OFF"))
 _UNCONFIGURED, _ESTOP, _FAULT = int(Mode.UNCONFIGURED), int(Mode.ESTOP), int(Mode.FAULT)
@@ -31,7 +31,6 @@ _NON_FINITE = int(Limit.NON_FINITE)
 _NONE, _BEGUN, _ENDED = int(Stage.NONE), int(Stage.BEGUN), int(Stage.ENDED)
 _NORMAL, _EMERGENCY_STOP = int(SafetyStatus.NORMAL), int(SafetyStatus.EMERGENCY_STOP)
 _LEAST, _MOST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
-_SPRING_WORK = 100  # values that a record of an impedance counts for: in Python its tick takes as long
 _MOST_TAKEN = 3  # commands in one tick, while another process fills the queue
 
 Numbers = NDArray[np.float64]
@@ -321,20 +320,7 @@ def follow_controller(state: Any, limits: Any) -> None:
 
 @kernel()
 def tick_robot(  # noqa: PLR0917
-    sim: int,
-    states: Any,
-    queues: Any,
-    estop: Counts,
-    monitors: Any,
-    arms: Any,
-    springs: Any,
-    limits: Any,
-    arm_limits: Any,
-    geometries: Any,
-    sensors: Numbers,
-    sensors_ns: Counts,
-    rows: Any,
-    now_ns: int,
+    sim: int, robots: Robots, monitors: Any, arms: Arms | None, springs: Springs | None, now_ns: int
 ) -> bool:
     """Run one tick of one of n robots, see `tick`; what they do not have is None.
 
@@ -342,17 +328,18 @@ def tick_robot(  # noqa: PLR0917
         sim: its number.
         monitors: those of their drives; one without beams may be one for all.
     """
-    state, queue, word, own = states[sim], queues[sim], estop[:, sim], limits[0]
-    seen, seen_ns, is_over = sensors[sim], sensors_ns[sim], True
+    state, queue, word, own = robots.states[sim], robots.queues[sim], robots.estop[:, sim], robots.limits[0]
+    seen, seen_ns, is_over = robots.sensors[sim], robots.sensors_ns[sim], True
     if arms is None:
         if monitors is not None:
             monitor = monitors[sim % len(monitors)]
             tick(state, queue, word, monitor, None, None, own, None, None, None, seen, seen_ns, now_ns)
         if springs is not None:
-            tick(state, queue, word, None, None, springs[sim], own, arm_limits[0], None, None, None, seen_ns, now_ns)
+            spring, its = springs.records[sim], springs.limits[0]
+            tick(state, queue, word, None, None, spring, own, its, None, None, None, seen_ns, now_ns)
     if arms is not None:
-        arm, its = arms[sim], arm_limits[0]
-        shapes = geometries[arm.geometry % len(geometries)]
+        arm, its, rows = arms.records[sim], arms.limits[0], arms.rows
+        shapes = arms.geometries[arm.geometry % len(arms.geometries)]
         if monitors is None:
             is_over = tick(state, queue, word, None, arm, None, own, its, shapes, rows, None, seen_ns, now_ns)
         if monitors is not None:
@@ -363,20 +350,7 @@ def tick_robot(  # noqa: PLR0917
 
 @kernel()
 def tick_all(  # noqa: PLR0917
-    states: Any,
-    queues: Any,
-    estop: Counts,
-    monitors: Any,
-    arms: Any,
-    springs: Any,
-    limits: Any,
-    arm_limits: Any,
-    geometries: Any,
-    sensors: Numbers,
-    sensors_ns: Counts,
-    rows: Any,
-    now_ns: int,
-    goes_on: bool,
+    robots: Robots, monitors: Any, arms: Arms | None, springs: Springs | None, now_ns: int, goes_on: bool
 ) -> bool:
     """Run one tick of n robots, see `tick_robot`.
 
@@ -387,44 +361,24 @@ def tick_all(  # noqa: PLR0917
         Whether none waits.
     """
     is_over = True
-    for sim in range(len(states)):
+    for sim in range(len(robots.states)):
         if arms is not None:
-            if goes_on and arms[sim].stage == _NONE:
+            if goes_on and arms.records[sim].stage == _NONE:
                 continue
             if not goes_on:
-                arms[sim].stage = _NONE
-        is_over &= tick_robot(
-            sim,
-            states,
-            queues,
-            estop,
-            monitors,
-            arms,
-            springs,
-            limits,
-            arm_limits,
-            geometries,
-            sensors,
-            sensors_ns,
-            rows,
-            now_ns,
-        )
+                arms.records[sim].stage = _NONE
+        is_over &= tick_robot(sim, robots, monitors, arms, springs, now_ns)
     return is_over
 
 
-_RECORDS = "state[::1], queue[::1], i8[:,:]"
-_SENSED = "f8[:,:], i8[:]"
-tick_bases = tick_all.of(
-    "tick_bases", f"b1({_RECORDS}, monitor[::1], none, none, limits[::1], none, none, {_SENSED}, none, i8, b1)"
-)
-_ARM = f"arm[::1], none, limits[::1], arm_limits[::1], geometry[::1], {_SENSED}, f8[:,:,:], i8, b1"
-tick_arms = tick_all.of("tick_arms", f"b1({_RECORDS}, none, {_ARM})")
-tick_mobile_arms = tick_all.of("tick_mobile_arms", f"b1({_RECORDS}, monitor[::1], {_ARM})")
-tick_springs = tick_all.of(
-    "tick_springs",
-    f"b1({_RECORDS}, none, none, spring[::1], limits[::1], arm_limits[::1], none, {_SENSED}, none, i8, b1)",
-    work=_SPRING_WORK,
-)
+ROBOTS = "Robots(state[::1], queue[::1], i8[:,::1], limits[::1], f8[:,::1], i8[::1])"
+MONITORS = "monitor[::1]"
+ARMS = "Arms(arm[::1], arm_limits[::1], geometry[::1], f8[:,:,::1])"
+SPRINGS = "Springs(spring[::1], arm_limits[::1])"
+tick_bases = tick_all.of("tick_bases", f"b1({ROBOTS}, {MONITORS}, none, none, i8, b1)")
+tick_arms = tick_all.of("tick_arms", f"b1({ROBOTS}, none, {ARMS}, none, i8, b1)")
+tick_mobile_arms = tick_all.of("tick_mobile_arms", f"b1({ROBOTS}, {MONITORS}, {ARMS}, none, i8, b1)")
+tick_springs = tick_all.of("tick_springs", f"b1({ROBOTS}, none, none, {SPRINGS}, i8, b1)")
 
 
 @kernel("void(state[::1], limits[::1], b1[:])")

@@ -6,13 +6,13 @@ The results are those of `Cerebellum.tick` and `World.step` in turns, bit for bi
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Arm, Drive
 from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.control.cerebellum import Cerebellum
-from bhd_lerobot.control.kernels import is_worth_compiling, kernel, record
+from bhd_lerobot.control.kernels import Kernel, group, is_plain, kernel, record
 from bhd_lerobot.control.messages import NANOSECONDS
-from bhd_lerobot.control.record import JOINTS
-from bhd_lerobot.control.tick import tick_robot, tick_springs
+from bhd_lerobot.control.record import JOINTS, Arms, Robots, Springs
+from bhd_lerobot.control.tick import ARMS, MONITORS, ROBOTS, SPRINGS, tick_robot
 from bhd_lerobot.sim.engine import mujoco
 from bhd_lerobot.sim.plant import Brakes, run_brake, set_brake
 from bhd_lerobot.sim.world import World
 
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _LEFT_OUT = ("read", "write", "set_mode", "step", "tick")  # methods that frames in machine code do not call
-_NO_RING: NDArray[np.float64] = np.zeros((0, 1, 1))
 _SHARES = 4  # of the simulations for each thread: what one waits for is done while others go on
 _OUTPUTS = 16  # fields that may be read after a frame
+_FIRST = np.zeros(1, np.intp)
 Counts = NDArray[np.int64]
 Numbers = NDArray[np.float64]
 
@@ -117,46 +117,86 @@ def _load() -> bool:
     return True
 
 
+@group
+class Physics(NamedTuple):
+    """The simulations, and the data of MuJoCo that one thread runs them in.
+
+    Attributes:
+        models: the address of each simulation's model, shape (n,).
+        data: the address of the data.
+        states: the address of the first simulation's state.
+        state_bytes: from one simulation's state to the next.
+        spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
+        qpos: this and the following are fields of the data; `torque` is ``qfrc_actuator``, `force` and `speed` are
+            ``actuator_force`` and ``actuator_velocity``.
+        touches: becomes True where something was touched, shape (kinds, n): by an arm the table, objects with one of
+            its links, itself; then by a base the scene.
+        efforts: mean efforts of the last tick, shape (n, nv).
+        layouts: where everything is, shape (1,).
+    """
+
+    models: Counts
+    data: int
+    states: int
+    state_bytes: int
+    spec: int
+    qpos: Numbers
+    qvel: Numbers
+    ctrl: Numbers
+    sensordata: Numbers
+    torque: Numbers
+    force: Numbers
+    speed: Numbers
+    touches: NDArray[np.bool_]
+    efforts: Numbers
+    layouts: Any
+
+
+@group
+class Delay(NamedTuple):
+    """By how much servos get their commands late.
+
+    Attributes:
+        ring: the last commands, shape (ticks, n, actuators); empty if none is late.
+        latency: by how many ticks they are late, shape (n,).
+        waited: ticks since that was set, shape (n,).
+        written: commands that were written to the ring.
+    """
+
+    ring: Numbers
+    latency: Counts
+    waited: Counts
+    written: int
+
+
+@group
+class Ticks(NamedTuple):
+    """Ticks of simulations.
+
+    Attributes:
+        times: what they are for [ns], shape (ticks,).
+        done: how many of these each simulation has done, shape (n,).
+        seen: becomes what is read of the joints after the last, as records of robots, shape (n,).
+    """
+
+    times: Counts
+    done: Counts
+    seen: Any
+
+
 @kernel()
-def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
+def run_frames(  # noqa: PLR0917
     ids: Counts,
-    models: Counts,
-    data: int,
-    rows: int,
-    row_bytes: int,
-    qpos: Numbers,
-    qvel: Numbers,
-    ctrl: Numbers,
-    sensordata: Numbers,
-    torque: Numbers,
-    force: Numbers,
-    speed: Numbers,
+    ticks: Ticks,
+    physics: Physics,
     warnings: NDArray[np.int32],
-    all_warnings: NDArray[np.int32],
-    states: Any,
-    queues: Any,
-    estop: Counts,
+    counted: NDArray[np.int32],
+    robots: Robots,
     monitors: Any,
-    limits: Any,
-    sensors: Numbers,
-    sensors_ns: Counts,
-    touches: NDArray[np.bool_],
-    efforts: Numbers,
-    layouts: Any,
-    seen: Any,
-    done: Counts,
-    times: Counts,
-    spec: int,
-    arms: Any,
-    springs: Any,
+    arms: Arms | None,
+    springs: Springs | None,
     brakes: Any,
-    arm_limits: Any,
-    geometries: Any,
-    ring: Any,
-    latency: Any,
-    waited: Any,
-    written: int,
-    trajectories: Any,
+    delay: Delay | None,
 ) -> None:
     """Let some ticks of some simulations go by, one simulation after the other.
 
@@ -164,124 +204,110 @@ def run_frames(  # noqa: PLR0912, PLR0915, PLR0917
 
     Args:
         ids: the simulations.
-        models: the address of each simulation's model.
-        data: the address of the data that they run in, whose fields the arrays after `row_bytes` are.
-        rows: the address of the first simulation's state; `row_bytes` from one to the next.
-        all_warnings: number of warnings of each simulation, as `Batch.warning`.
-        touches: becomes True where something was touched, shape (kinds, n): by an arm the table, objects with one of
-            its links, itself; then by a base the scene.
-        efforts: mean efforts of the last tick, shape (n, nv).
-        seen: becomes what is read of the joints after the last tick, as records of robots, shape (n,).
-        done: how many of these ticks each simulation has done, shape (n,).
-        times: what the ticks are for [ns], shape (ticks,).
-        spec: what a state consists of, `mjSTATE_INTEGRATION` of this version of MuJoCo.
+        warnings: how often MuJoCo has warned in this data, by kind.
+        counted: warnings of each simulation, as `Batch.warning`.
         monitors: records of the collision monitors of bases; None of robots that do not drive.
-        arms: records of arms with position servos; None of others, as is what follows of those without an arm.
-        springs: records of the impedances of arms with torque motors; None of others, as is the following.
-        brakes: for how many ticks the arms' brakes are closed, shape (n,).
-        ring: the last commands, of servos that get them late, shape (ticks, n, actuators); empty if none is late.
-        latency: by how many ticks they are late, shape (n,).
-        waited: ticks since that was set, shape (n,).
-        written: commands that were written to the ring.
-        trajectories: what arms play.
+        arms: arms with position servos; None of others.
+        springs: arms with torque motors; None of others.
+        brakes: for how many ticks these arms' brakes are closed, shape (n,).
+        delay: of robots with an arm; None of others.
     """
-    layout = layouts[0]
-    joints = layout.joints
+    layout, last = physics.layouts[0], len(ticks.times) - 1
     for sim in ids:
-        state = states[sim]
-        _set_state(models[sim], data, rows + sim * row_bytes, spec)
+        state, efforts = robots.states[sim], physics.efforts[sim]
+        model, address = physics.models[sim], physics.states + sim * physics.state_bytes
+        _set_state(model, physics.data, address, physics.spec)
         warnings[:] = 0
-        for number in range(done[sim], len(times)):
-            now_ns = times[number]
-            is_begun = False
-            if arms is not None:
-                is_begun = arms[sim].stage != 0
-            if not is_begun:
-                read_joints(state, layout, qpos, qvel, efforts[sim], now_ns)
-            if not tick_robot(
-                sim,
-                states,
-                queues,
-                estop,
-                monitors,
-                arms,
-                springs,
-                limits,
-                arm_limits,
-                geometries,
-                sensors,
-                sensors_ns,
-                trajectories,
-                now_ns,
-            ):
+        for number in range(ticks.done[sim], last + 1):
+            now_ns = ticks.times[number]
+            if not is_waiting(sim, arms):
+                read_joints(state, layout, physics.qpos, physics.qvel, efforts, now_ns)
+            if not tick_robot(sim, robots, monitors, arms, springs, now_ns):
                 break
             if springs is not None:
-                closing = ctrl[layout.brake : layout.brake + arm_limits[0].dof]
-                if state.mode_is_new:
-                    set_brake(brakes, sim, state.mode)
-                    state.mode_is_new = False
-                speeds = qvel[layout.qvel[0] : layout.qvel[0] + arm_limits[0].dof]
-                run_brake(brakes, closing, speeds, sim, layout.friction, layout.closing_ticks)
-            if ring is None:
-                for k in range(joints):
-                    ctrl[layout.ctrl[k]] = state.written[k]
-            if ring is not None:
-                slot = written + number
-                behind = slot - min(latency[sim], waited[sim] + number)
-                for k in range(joints):
-                    ctrl[layout.ctrl[k]] = state.written[k]
-                    if len(ring):
-                        ring[slot % len(ring), sim, k] = state.written[k]
-                        ctrl[layout.ctrl[k]] = ring[behind % len(ring), sim, k]
-            done[sim] = number + 1
+                hold_brakes(sim, state, physics, layout, brakes, springs.limits[0].dof)
+            write_commands(sim, state, physics.ctrl, layout, delay, number)
+            ticks.done[sim] = number + 1
             for step in range(layout.substeps):
-                _step(models[sim], data)
-                if layout.touch_base >= 0 and sensordata[layout.touch_base] != 0.0:
-                    touches[len(touches) - 1, sim] = True
-                if layout.touch >= 0 and sensordata[layout.touch] != 0.0:
-                    note_touches(touches, sim, sensordata, layout)
-                for k in range(joints):
-                    dof = layout.qvel[k]
-                    value = torque[dof]
-                    if layout.is_exact or layout.substeps > 1:
-                        servo, gear = layout.ctrl[k], layout.gear[k]
-                        is_inside = abs(force[servo]) < layout.most_force[k] and abs(value) < layout.most_torque[k]
-                        if is_inside:
-                            value -= gear * layout.damping[k] * (gear * qvel[dof] - speed[servo])
-                    efforts[sim, dof] = value if step == 0 else efforts[sim, dof] + value
-            if layout.substeps > 1:
-                for k in range(joints):
-                    efforts[sim, layout.qvel[k]] /= layout.substeps
-            if layout.gyro >= 0:
-                for k in range(3):
-                    sensors[sim, layout.beams + k] = sensordata[layout.gyro + k]
+                _step(model, physics.data)
+                note_touches(sim, physics, layout)
+                add_efforts(efforts, physics, layout, step)
+            for k in range(3 if layout.gyro >= 0 else 0):
+                robots.sensors[sim, layout.beams + k] = physics.sensordata[layout.gyro + k]
         state.mode_is_new = False
-        _get_state(models[sim], data, rows + sim * row_bytes, spec)
+        _get_state(model, physics.data, address, physics.spec)
         for k in range(len(warnings)):
-            all_warnings[sim, k, 1] += warnings[k]
-        if done[sim] == len(times):
-            read_joints(seen[sim], layout, qpos, qvel, efforts[sim], times[len(times) - 1])
+            counted[sim, k, 1] += warnings[k]
+        if ticks.done[sim] > last:
+            read_joints(ticks.seen[sim], layout, physics.qpos, physics.qvel, efforts, ticks.times[last])
             for k in range(layout.outputs):
                 _copy(layout.target[k] + sim * layout.nbytes[k], layout.source[k], layout.nbytes[k])
 
 
-_WHERE = (
-    "i8[::1], i8[::1], i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i4[:], i4[:,:,:], "
-    "state[::1], queue[::1], i8[:,:]"
+_RUN = (
+    "i8[::1], Ticks(i8[::1], i8[::1], state[::1]), "
+    "Physics(i8[::1], i8, i8, i8, i8, f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], b1[:,::1], "
+    f"f8[:,::1], layout[::1]), i4[:], i4[:,:,:], {ROBOTS}"
 )
-_WHAT = "limits[::1], f8[:,:], i8[:], b1[:,:], f8[:,:], layout[::1], state[::1], i8[:], i8[::1], i4"
-_LATE = "f8[:,:,:], i8[:], i8[:], i8"
-_ARM = f"{_WHAT}, arm[::1], none, none, arm_limits[::1], geometry[::1], {_LATE}, f8[:,:,:]"
-run_base_frames = run_frames.of(
-    "run_base_frames", f"void({_WHERE}, monitor[::1], {_WHAT}, {', '.join(['none'] * 8)}, i8, none)"
+_DELAY = "Delay(f8[:,:,::1], i8[::1], i8[::1], i8)"
+run_base_frames = run_frames.of("run_base_frames", f"void({_RUN}, {MONITORS}, none, none, none, none)")
+run_arm_frames = run_frames.of("run_arm_frames", f"void({_RUN}, none, {ARMS}, none, none, {_DELAY})")
+run_mobile_arm_frames = run_frames.of(
+    "run_mobile_arm_frames", f"void({_RUN}, {MONITORS}, {ARMS}, none, none, {_DELAY})"
 )
-run_arm_frames = run_frames.of("run_arm_frames", f"void({_WHERE}, none, {_ARM})")
-run_mobile_arm_frames = run_frames.of("run_mobile_arm_frames", f"void({_WHERE}, monitor[::1], {_ARM})")
-run_spring_frames = run_frames.of(
-    "run_spring_frames",
-    f"void({_WHERE}, none, {_WHAT}, none, spring[::1], i8[:], arm_limits[::1], none, {_LATE}, none)",
-    work=tick_springs.work,
-)
+run_spring_frames = run_frames.of("run_spring_frames", f"void({_RUN}, none, none, {SPRINGS}, i8[::1], {_DELAY})")
+
+
+@kernel()
+def is_waiting(sim: int, arms: Arms | None) -> bool:
+    """Return whether a tick of a simulation has begun, and waited for its controller."""
+    if arms is not None:
+        return arms.records[sim].stage != 0
+    return False
+
+
+@kernel()
+def hold_brakes(  # noqa: PLR0917
+    sim: int, state: Any, physics: Physics, layout: Any, brakes: Counts, dof: int
+) -> None:
+    """Open or close the brakes of an arm, and advance them by one tick."""
+    if state.mode_is_new:
+        set_brake(brakes, sim, state.mode)
+        state.mode_is_new = False
+    closing = physics.ctrl[layout.brake : layout.brake + dof]
+    speeds = physics.qvel[layout.qvel[0] : layout.qvel[0] + dof]
+    run_brake(brakes, closing, speeds, sim, layout.friction, layout.closing_ticks)
+
+
+@kernel()
+def write_commands(  # noqa: PLR0917
+    sim: int, state: Any, ctrl: Numbers, layout: Any, delay: Delay | None, number: int
+) -> None:
+    """Write what a tick commands to the actuators; of servos that are late, what it commanded some ticks ago."""
+    for k in range(layout.joints):
+        ctrl[layout.ctrl[k]] = state.written[k]
+    if delay is not None:
+        slot = delay.written + number
+        behind = slot - min(delay.latency[sim], delay.waited[sim] + number)
+        for k in range(layout.joints if len(delay.ring) else 0):
+            delay.ring[slot % len(delay.ring), sim, k] = state.written[k]
+            ctrl[layout.ctrl[k]] = delay.ring[behind % len(delay.ring), sim, k]
+
+
+@kernel()
+def add_efforts(efforts: Numbers, physics: Physics, layout: Any, step: int) -> None:
+    """Add the efforts of a physics step to their sum over a tick; with the last step they are its means."""
+    for k in range(layout.joints):
+        dof = layout.qvel[k]
+        value = physics.torque[dof]
+        if layout.is_exact or layout.substeps > 1:
+            servo, gear = layout.ctrl[k], layout.gear[k]
+            is_inside = abs(physics.force[servo]) < layout.most_force[k] and abs(value) < layout.most_torque[k]
+            if is_inside:
+                value -= gear * layout.damping[k] * (gear * physics.qvel[dof] - physics.speed[servo])
+        efforts[dof] = value if step == 0 else efforts[dof] + value
+        if 0 < step == layout.substeps - 1:
+            efforts[dof] /= layout.substeps
 
 
 @kernel()
@@ -305,15 +331,19 @@ def read_joints(  # noqa: PLR0917
 
 
 @kernel()
-def note_touches(touches: NDArray[np.bool_], sim: int, sensordata: Numbers, layout: Any) -> None:
-    """Note what an arm touches now; the counts are whole numbers, and their sums exact."""
-    grip = 0.0
-    for k in range(layout.touch_grip[1]):
-        grip += sensordata[layout.touch_grip[0] + k]
-    table, itself = sensordata[layout.touch_table], sensordata[layout.touch_self]
-    touches[0, sim] |= table > 0.0
-    touches[1, sim] |= sensordata[layout.touch] > table + itself + grip
-    touches[2, sim] |= itself > 0.0
+def note_touches(sim: int, physics: Physics, layout: Any) -> None:
+    """Note what a base and an arm touch now; the counts are whole numbers, and their sums exact."""
+    touches, sensordata = physics.touches, physics.sensordata
+    if layout.touch_base >= 0 and sensordata[layout.touch_base] != 0.0:
+        touches[len(touches) - 1, sim] = True
+    if layout.touch >= 0 and sensordata[layout.touch] != 0.0:
+        grip = 0.0
+        for k in range(layout.touch_grip[1]):
+            grip += sensordata[layout.touch_grip[0] + k]
+        table, itself = sensordata[layout.touch_table], sensordata[layout.touch_self]
+        touches[0, sim] |= table > 0.0
+        touches[1, sim] |= sensordata[layout.touch] > table + itself + grip
+        touches[2, sim] |= itself > 0.0
 
 
 class Late(Protocol):
@@ -323,22 +353,19 @@ class Late(Protocol):
     latency: Counts
     waited: Counts
     written: int
-
-    @property
-    def is_late(self) -> bool:
-        """Whether any are."""
+    is_late: bool
 
     def pass_by(self, ticks: int) -> None:
         """Count commands that were written to the ring."""
 
 
 class Frames:
-    """Lets ticks of n simulated robots go by, in machine code once that is worth its compilation.
+    """Lets ticks of n simulated robots go by in machine code.
 
     Args:
         world: the simulations.
         cerebellum: what controls them; its controller is a part of the compiled tick.
-        touches: becomes True where the scene was touched, see `run_frames`, shape (kinds, n).
+        touches: becomes True where the scene was touched, see `Physics`, shape (kinds, n).
         seen: becomes what is read of the joints after the last tick, shape (n,).
         late: what its plant passes commands on through; None if it passes them on at once.
         brakes: those of arms with torque motors.
@@ -359,9 +386,7 @@ class Frames:
         beams: int = 0,
     ) -> None:
         self._world, self._cerebellum, self._touches, self._late = world, cerebellum, touches, late
-        self._seen_states = seen
         self._plant, self._pid = cerebellum.plant, os.getpid()
-        self._handled = 0
         model, self._layout = world.model, np.zeros(1, LAYOUT)
         row, efforts = self._layout[0], world.servos
         row["substeps"] = world.physics_hz // cerebellum.control_hz
@@ -386,14 +411,13 @@ class Frames:
         self._threads: list[_Thread] = []
         self._free: SimpleQueue[_Thread] = SimpleQueue()
         self._pool: ThreadPoolExecutor | None = None
-        self._addresses, self._done, self._zeros = np.zeros((3, world.n), np.int64)
-        self._one_tick: Callable[[int, Any], None] | None = None
-        self._made_with: tuple[Any, ...] = ()
-        self._now = np.zeros(1, np.int64)
-        self._at_once = _NO_RING, self._zeros, self._zeros
+        self._addresses, done, zeros = np.zeros((3, world.n), np.int64)
+        self._one_tick = Ticks(np.zeros(1, np.int64), done, seen)
+        self._is_prepared = False
+        self._at_once = None if late is None else Delay(np.zeros((0, 1, 1)), zeros, zeros, 0)
         self._checked, self._copies = -1, False
         controller, self._brakes = cerebellum.controller, brakes
-        self._kernel = run_base_frames
+        self._kernel: Kernel[..., None] = run_base_frames
         if controller.arms is not None:
             self._kernel = run_arm_frames if controller.monitors is None else run_mobile_arm_frames
         elif controller.springs is not None:
@@ -449,17 +473,13 @@ class Frames:
         """
         own = self._cerebellum
         ids = np.arange(self._world.n) if ids is None else ids
-        self._handled += len(ids) * self._kernel.work
         if not self._is_ready():
             return False
-        self._done[ids] = 0
-        if own.controller.arms is not None:
-            own.controller.arms["stage"] = 0  # whatever interrupted the last frame
         times = np.arange(first_tick, first_tick + ticks) * NANOSECONDS // own.control_hz
-        self._run(ids, times)
+        self._begin(ids)
+        self._run(ids, self._one_tick._replace(times=times))
         own.now_ns = int(times[-1])
-        if self._late is not None and self._late.is_late:
-            self._late.pass_by(ticks)
+        self._end(ticks)
         return True
 
     def tick(self, now_ns: int) -> bool:
@@ -468,42 +488,53 @@ class Frames:
         Returns:
             False if nothing was done, as `run`; also if there are more robots.
         """
-        own, late = self._cerebellum, self._late
-        is_late = late is not None and late.is_late
-        parts = own.plant, own.fifo, own.estop, is_late, len(self._world.outputs)
-        if self._one_tick is None or parts != self._made_with:
-            if self._world.n > 1 or not self._is_ready():
+        own = self._cerebellum
+        if not self._is_prepared or own.plant is not self._plant:
+            self._is_prepared = self._world.n == 1 and self._is_ready()
+            if not self._is_prepared:
                 return False
-            rest = self._seen_states, self._done, self._now
-            arguments = self._threads[0].arguments(self._addresses, self._shared, *rest)
-            self._one_tick, self._made_with = partial(self._kernel.compiled, np.zeros(1, np.intp), *arguments), parts
-        own.now_ns = self._now[0] = now_ns
-        self._done[0] = 0
-        if own.controller.arms is not None:
-            own.controller.arms["stage"] = 0
+        if not self._are_copied:
+            return False
+        own.now_ns = self._one_tick.times[0] = now_ns
+        self._begin(_FIRST)
+        thread = self._threads[0]
         while True:
-            self._one_tick(*self._varying)
-            if self._done[0]:
+            thread.run(self._kernel, _FIRST, self._one_tick, *self._parts)
+            if self._one_tick.done[0]:
                 break
             own.serve()
-        if late is not None and is_late:
-            late.pass_by(1)
+        self._end(1)
+        return True
+
+    def _begin(self, ids: NDArray[np.intp]) -> None:
+        self._one_tick.done[ids] = 0
+        if (arms := self._cerebellum.controller.arms) is not None:
+            arms["stage"] = 0  # whatever interrupted the last frame
+
+    def _end(self, ticks: int) -> None:
+        if self._late is not None and self._late.is_late:
+            self._late.pass_by(ticks)
+
+    def load(self) -> bool:
+        """Load the machine code; return whether there is any for these robots."""
+        if not self._is_possible or is_plain() or not _load():
+            return False
+        self._kernel.load()
         return True
 
     def _is_ready(self) -> bool:
         """Prepare for machine code; return whether it does what Python would."""
         own = self._cerebellum
-        if not self._is_possible or own.plant is not self._plant or not own.may_write or self._is_watched:
+        if own.plant is not self._plant or not own.may_write or self._is_watched:
             return False
-        if not is_worth_compiling(self._kernel, self._handled) or not _load():
-            return False
-        if not self._are_copied:
+        if not self.load() or not self._are_copied:
             return False
         self._take_models()
         if self._pid != os.getpid():  # after a fork there are no threads
             self._pid, self._pool, self._threads, self._free = os.getpid(), None, [], SimpleQueue()
         if not self._threads:
-            self._threads = [_Thread(self._world, self._layout) for _ in range(self._world.threads)]
+            shared = self._addresses, self._touches, self._layout
+            self._threads = [_Thread(self._world, *shared) for _ in range(self._world.threads)]
             for thread in self._threads:
                 self._free.put(thread)
             if len(self._threads) > 1:
@@ -512,7 +543,7 @@ class Frames:
 
     def forget(self) -> None:
         """Prepare anew before the next `tick`: another scene has begun, or fields of models have changed."""
-        self._one_tick = None
+        self._is_prepared = False
 
     @property
     def _is_watched(self) -> bool:
@@ -520,16 +551,16 @@ class Frames:
         watched = self._plant, getattr(self._plant, "plant", self._plant), self._world, self._cerebellum
         return any(name in vars(one) for one in watched for name in _LEFT_OUT)
 
-    def _run(self, ids: NDArray[np.intp], times: Counts) -> None:
+    def _run(self, ids: NDArray[np.intp], ticks: Ticks) -> None:
         """Let ticks go by; what ticks of some simulations wait for is done while others go on."""
         if self._pool is None:
             while len(ids):
-                ids = self._run_share(ids, times, self._shared)
+                ids = self._run_share(ids, ticks)
                 if len(ids):
                     self._cerebellum.serve(ids)
             return
         shares = np.array_split(ids, min(len(ids), _SHARES * len(self._threads)))
-        jobs = {self._pool.submit(self._run_share, share, times, self._shared) for share in shares}
+        jobs = {self._pool.submit(self._run_share, share, ticks) for share in shares}
         try:
             while jobs:
                 done, jobs = wait(jobs, return_when=FIRST_COMPLETED)
@@ -537,18 +568,29 @@ class Frames:
                     left = job.result()
                     if len(left):
                         self._cerebellum.serve(left)
-                        jobs.add(self._pool.submit(self._run_share, left, times, self._shared))
+                        jobs.add(self._pool.submit(self._run_share, left, ticks))
         finally:
             wait(jobs)  # whatever interrupts this: no other frame begins meanwhile
 
-    def _run_share(self, ids: NDArray[np.intp], times: Counts, shared: Any) -> NDArray[np.intp]:
+    def _run_share(self, ids: NDArray[np.intp], ticks: Ticks) -> NDArray[np.intp]:
         """Let ticks of some simulations go by; return those that wait for their controller."""
         thread = self._free.get()
         try:
-            thread.run(self._kernel, ids, self._addresses, shared, self._seen_states, self._done, times, *self._varying)
+            thread.run(self._kernel, ids, ticks, *self._parts)
         finally:
             self._free.put(thread)
-        return ids[self._done[ids] < len(times)]
+        return ids[ticks.done[ids] < len(ticks.times)]
+
+    @property
+    def _parts(self) -> tuple[Any, ...]:
+        """What `run_frames` takes behind the physics, as it is now."""
+        own, late = self._cerebellum, self._late
+        monitors, arms, springs = own.controller.parts
+        brakes = None if springs is None or self._brakes is None else self._brakes.ticks
+        delay = self._at_once
+        if late is not None and late.is_late:
+            delay = Delay(late.ring, late.latency, late.waited, late.written)
+        return self._world.warnings, own.robots, monitors, arms, springs, brakes, delay
 
     @property
     def _are_copied(self) -> bool:
@@ -564,28 +606,6 @@ class Frames:
             )
             self._checked = len(outputs)
         return self._copies
-
-    @property
-    def _shared(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """What all threads run with, before and after the layout; behind it comes what `_varying` is."""
-        own, late = self._cerebellum, self._late
-        controller, reading = own.controller, own.reading
-        records = own.states, own.fifo.queues, own.estop.words, controller.monitors
-        sensors = reading.sensors, reading.sensors_ns, self._touches, self._world.efforts
-        arms: tuple[Any, ...] = (None,) * 8
-        if controller.arm_limits is not None:
-            if controller.arms is not None:
-                arms = controller.arms, None, None, controller.arm_limits, controller.geometries
-            elif self._brakes is not None:
-                arms = None, controller.springs, self._brakes.ticks, controller.arm_limits, None
-            arms += (late.ring, late.latency, late.waited) if late and late.is_late else self._at_once
-        return (self._world.warnings, *records, own.numbers, *sensors), arms
-
-    @property
-    def _varying(self) -> tuple[int, Any]:
-        """What changes from frame to frame: commands that were written to the ring, and trajectories."""
-        late = self._late
-        return late.written if late and late.is_late else 0, self._cerebellum.controller.rows
 
     def _take_models(self) -> None:
         """Make the simulations' models again if their fields have changed."""
@@ -609,32 +629,43 @@ class Frames:
 
 
 class _Thread:
-    """What one thread runs frames in: MuJoCo's data, and where its fields are."""
+    """What one thread runs frames in."""
 
-    def __init__(self, world: World, layout: NDArray) -> None:
-        self._world, self._layout = world, layout.copy()
+    def __init__(self, world: World, addresses: Counts, touches: NDArray[np.bool_], layout: NDArray) -> None:
+        self._world = world
         self._data = data = mujoco.MjData(world.model)
-        fields = data.qpos, data.qvel, data.ctrl, data.sensordata, data.qfrc_actuator
-        self._fields = (*fields, data.actuator_force, data.actuator_velocity, data.warning.number)
+        self._warnings = data.warning.number
+        self._physics = Physics(
+            models=addresses,
+            data=data._address,
+            states=world.state.ctypes.data,
+            state_bytes=world.state.strides[0],
+            spec=_STATE,
+            qpos=data.qpos,
+            qvel=data.qvel,
+            ctrl=data.ctrl,
+            sensordata=data.sensordata,
+            torque=data.qfrc_actuator,
+            force=data.actuator_force,
+            speed=data.actuator_velocity,
+            touches=touches,
+            efforts=world.efforts,
+            layouts=layout.copy(),
+        )
         self._outputs = 0
         self._lock = Lock()  # after an interruption the last frame may still be running
 
-    def run(self, *arguments: Any) -> None:
+    def run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, *parts: Any) -> None:
+        """Let ticks of some simulations go by."""
         with self._lock:
-            self._run(*arguments)
+            self._run(one, ids, ticks, *parts)
 
-    def _run(self, kernel: Any, ids: NDArray, models: Counts, shared: tuple[Any, Any], *rest: Any) -> None:
-        *before, written, rows = rest
-        kernel.compiled(ids, *self.arguments(models, shared, *before), written, rows)
-
-    def arguments(self, models: Counts, shared: tuple[Any, Any], *rest: Any) -> tuple[Any, ...]:
-        """Return the arguments of `run_frames` but the first and the last two."""
-        state, row = self._world.state, self._layout[0]
-        if len(self._world.outputs) != self._outputs:
-            for k, (name, target) in enumerate(self._world.outputs.items()):
+    def _run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, *parts: Any) -> None:
+        outputs = self._world.outputs
+        if len(outputs) != self._outputs:
+            row = self._physics.layouts[0]
+            for k, (name, target) in enumerate(outputs.items()):
                 row["source"][k], row["target"][k] = getattr(self._data, name).ctypes.data, target.ctypes.data
                 row["nbytes"][k] = target[0].nbytes
-            self._outputs = row["outputs"] = len(self._world.outputs)
-        where = self._data._address, state.ctypes.data, state.strides[0]
-        before, arms = shared
-        return (models, *where, *self._fields, *before, self._layout, *rest, _STATE, *arms)
+            self._outputs = row["outputs"] = len(outputs)
+        one.compiled(ids, ticks, self._physics, self._warnings, *parts)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Body, Rates
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, Chunk, CommandResult, Goals
-from bhd_lerobot.control.kernels import never_compiled
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, unknown_name
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures, is_privileged
@@ -32,8 +31,7 @@ class GoalStreamer:
 
     def __init__(self, body: Body, rates: Rates, start: NDArray[np.float64]) -> None:
         self._rates = rates
-        with never_compiled():  # LeRobot's loop has begun
-            self._controller = ArmController(body, 1, rates.control_hz, rates.ticks_per_frame)
+        self._controller = ArmController(body, 1, rates.control_hz, rates.ticks_per_frame)
         self._reading = PlantReading(1, self._controller.joints, states=self._controller.states)
         self._reading.position[0] = start[: self._controller.joints]
         self._controller.configure(np.zeros(1, np.intp), self._reading)

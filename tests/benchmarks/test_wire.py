@@ -38,6 +38,6 @@ def test_the_judge_is_not_blind(monkeypatch: pytest.MonkeyPatch) -> None:
         return True
 
     monkeypatch.setattr(tick, "guard", let_through)
-    with np.errstate(all="ignore"), kernels.never_compiled():
+    with np.errstate(all="ignore"), kernels.plain_python():
         _, vandalised = wire.run("joints", len(wire.KINDS), 8, 1)
     assert vandalised.unsafe > 0

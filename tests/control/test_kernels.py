@@ -3,7 +3,6 @@
 import ast
 import importlib
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from bhd_lerobot.control.arm.step import Stage
 from bhd_lerobot.control.drive import BaseController, read_odometry
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.control.record import Arms, Robots
 from tests.control.test_wire import arm, base_rig, twist_rig
 
 ROOT = Path(bhd_lerobot.__file__).parents[1]
@@ -86,20 +86,46 @@ def records(name: str, rng: np.random.Generator) -> Any:
     return made
 
 
-def drawn(kind: str, rng: np.random.Generator) -> Any:
-    """Return an argument of a type in numba's words, large enough for two robots with up to six values."""
-    if kind == "none":
+class Kind:
+    """A type of an argument in numba's words."""
+
+    def __init__(self, name: str, dimensions: int = 0) -> None:
+        self.name, self.dimensions = name, dimensions
+
+    def __getitem__(self, axes: slice | tuple[slice, ...]) -> "Kind":
+        return Kind(self.name, len(axes) if isinstance(axes, tuple) else 1)
+
+    def __call__(self, *fields: Any) -> Any:
+        return kernels.TUPLES[self.name]._make(fields) if self.name in kernels.TUPLES else fields  # type: ignore[attr-defined]
+
+
+class Kinds(dict):
+    """Every name is a type."""
+
+    def __missing__(self, name: str) -> Kind:
+        return Kind(name)
+
+
+def drawn(kind: Any, rng: np.random.Generator) -> Any:
+    """Return an argument of a type, large enough for two robots with up to six values."""
+    if isinstance(kind, tuple):
+        made = [drawn(one, rng) for one in kind]
+        if isinstance(kind, Robots):  # the words of emergency stops
+            made[2] = drawn_array("i8", (3, 2), rng)
+        elif isinstance(kind, Arms):
+            made[3] = drawn_array("f8", (2, 3, 8), rng)
+        return type(kind)(*made)  # type: ignore[arg-type]
+    if kind.name == "none":
         return None
-    name, _, dimensions = kind.partition("[")
-    if name in kernels.RECORDS:
-        return records(name, rng)
-    shape = (2, 2, 6)[-1 - dimensions.count(",") :] if dimensions else ()
-    if kind == "i8[:,:]":  # the words of emergency stops
-        shape = (3, 2)
-    if kind == "f8[:,:,:]":  # what arms play
-        shape = (2, 3, 8)
-    if name == "float64" and dimensions:  # room for any arm
-        shape = (19, 8)[-1 - dimensions.count(",") :]
+    if kind.name in kernels.RECORDS:
+        return records(kind.name, rng)
+    shape = (2, 2, 6)[-kind.dimensions :] if kind.dimensions else ()
+    if kind.name == "float64" and kind.dimensions:  # room for any arm
+        shape = (19, 8)[-kind.dimensions :]
+    return drawn_array(kind.name, shape, rng)
+
+
+def drawn_array(name: str, shape: tuple[int, ...], rng: np.random.Generator) -> Any:
     if name in ("i8", "i1"):
         return rng.integers(-1, 3, shape).astype(name) if shape else int(rng.integers(-1, 2))
     if name == "b1":
@@ -108,7 +134,20 @@ def drawn(kind: str, rng: np.random.Generator) -> Any:
     return values if shape else np.float64(values)
 
 
+def copied(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return type(value)(*map(copied, value))  # type: ignore[arg-type]
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
 def assert_same(one: Any, other: Any, what: str) -> None:
+    if isinstance(one, tuple):
+        for name, mine, its in zip(one._fields, one, other, strict=True):  # type: ignore[attr-defined]
+            assert_same(mine, its, f"{what}: {name}")
+        return
+    if one is None:
+        return
+    one, other = np.asarray(one), np.asarray(other)
     if one.dtype.names:
         for name in one.dtype.names:
             assert_same(one[name], other[name], f"{what}: {name}")
@@ -121,19 +160,19 @@ def assert_same(one: Any, other: Any, what: str) -> None:
 @pytest.mark.parametrize("name", sorted(KERNELS))
 def test_compiled_and_as_plain_python_it_writes_the_same_bits(name: str) -> None:
     one = KERNELS[name]
-    kinds = re.findall(r"\w+(?:\[[^\]]*\])?", one.signature.partition("(")[2])
+    kinds = eval(one.signature, {}, Kinds())
     rng = np.random.default_rng(0)
     for _ in range(10 if name == "find_posture" else 100):  # which takes many steps
         plain = [drawn(kind, rng) for kind in kinds]
         if name == "tick_mobile_arms":  # a tick that has begun has judged its reading
-            plain[4]["stage"][plain[4]["stage"] == Stage.BEGUN] = Stage.NONE
-        compiled = [value.copy() if isinstance(value, np.ndarray) else value for value in plain]
-        with np.errstate(all="ignore"):
-            assert one(*map(kernels.as_objects, plain)) == one.compiled(*compiled)
-        for k, (mine, other) in enumerate(zip(plain, compiled, strict=True)):
-            if mine is None:
-                continue
-            assert_same(np.asarray(mine), np.asarray(other), f"argument {k}")
+            stage = plain[2].records["stage"]
+            stage[stage == Stage.BEGUN] = Stage.NONE
+        compiled = [copied(value) for value in plain]
+        with np.errstate(all="ignore"), kernels.plain_python():
+            result = one.run(*plain)
+        assert result == one.run(*compiled)
+        for k, (mine, its) in enumerate(zip(plain, compiled, strict=True)):
+            assert_same(mine, its, f"argument {k}")
 
 
 def test_no_kernel_raises_to_a_power() -> None:
@@ -147,19 +186,12 @@ def test_no_kernel_raises_to_a_power() -> None:
                 assert not powers, f"{path}: {one.name}"
 
 
-@pytest.fixture
-def eager(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile kernels when they are bound."""
-    monkeypatch.setattr(kernels, "_values", 1)
-    kernels.compile_at_once()
-
-
 @pytest.mark.parametrize("make", [base_rig, twist_rig, arm])
-@pytest.mark.usefixtures("eager")
-def test_a_tick_of_a_loop_on_the_wall_clock_compiles_nothing(make: Callable[[], Any]) -> None:
+def test_what_was_loaded_compiles_nothing_in_a_loop_on_the_wall_clock(make: Callable[[], Any]) -> None:
     from numba.core.event import install_recorder
 
     rig = make()
+    rig.cerebellum.load()
     with install_recorder("numba:compile") as record:
         rig.tick(50)
         rig.cerebellum.estop.press()
@@ -173,46 +205,8 @@ def test_a_kernel_takes_no_other_types_than_it_was_compiled_for() -> None:
     good: list[Any] = [base.states, base.numbers, np.zeros((1, 2)), np.zeros((1, 3))]
     for position in range(4):
         for bad in (np.zeros((1, 3), np.float32), np.zeros(3)):
-            arrays = [bad if k == position else one for k, one in enumerate(good)]
             with pytest.raises(TypeError, match="No matching definition"):
-                read_odometry.compiled(*arrays)
-            with pytest.raises(TypeError, match=f"Argument {position} of read_odometry is an array of"):
-                Kernel(read_odometry.function, read_odometry.signature).bind()(*arrays)
-
-
-@pytest.fixture
-def compilations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the names of the kernels that are compiled from now on; they stay Python."""
-    names: list[str] = []
-
-    def compiled(one: Kernel[..., Any]) -> Callable[..., Any]:
-        names.append(one.function.__name__)
-        return lambda *arguments: one.function(*map(kernels.as_objects, arguments))
-
-    monkeypatch.setattr(Kernel, "compiled", property(compiled))
-    for one in KERNELS.values():
-        monkeypatch.delitem(vars(one), "compiled", raising=False)
-    monkeypatch.setattr(kernels, "_values", 240)
-    return names
-
-
-def drive(ticks: int) -> None:
-    base = BaseController(turtlebot3_burger().drive, 3, 200)
-    for tick in range(ticks):
-        base.odometry_at(np.full((3, 2), 0.1 * tick))
-
-
-def test_a_kernel_is_compiled_once_it_has_run_for_long(compilations: list[str]) -> None:
-    drive(10)  # of three robots
-    assert compilations == []
-    drive(12)
-    assert compilations == ["read_odometry"]
-    with kernels.never_compiled():
-        drive(12)
-    assert compilations == ["read_odometry"]
-    kernels.compile_at_once()
-    drive(0)
-    assert compilations == ["read_odometry", "read_odometry"]
+                read_odometry.run(*(bad if k == position else one for k, one in enumerate(good)))
 
 
 def test_arrays_of_a_reading_are_not_replaced() -> None:
@@ -232,7 +226,7 @@ def start(cache: Path, **environment: str) -> subprocess.Popen:
         "from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger\n"
         "from bhd_lerobot.control.drive import BaseController, read_odometry\n"
         "base, odometry = BaseController(turtlebot3_burger().drive, 1, 200), np.zeros((1, 3))\n"
-        "read_odometry.compiled(base.states, base.numbers, np.ones((1, 2)), odometry)\n"
+        "read_odometry.run(base.states, base.numbers, np.ones((1, 2)), odometry)\n"
         "print(odometry.tolist())\n"
     )
     return subprocess.Popen(

@@ -2,7 +2,6 @@
 
 import threading
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,15 +22,6 @@ from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 
 FRAMES = 30
-
-
-@pytest.fixture
-def compiled() -> Iterator[None]:
-    """Compile frames at once."""
-    before = kernels._values
-    kernels.compile_at_once()
-    yield
-    kernels._values = before
 
 
 def count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -94,7 +84,6 @@ def run(
     return np.array(rows)
 
 
-@pytest.mark.usefixtures("compiled")
 @each_case(
     "options",
     [{}, {"imu": True, "collision_monitor": True}, {"physics_hz": 600}, {"physics_hz": 100, "control_hz": 50}],
@@ -110,7 +99,7 @@ def test_frames_are_the_bits_of_ticks_and_steps_in_turns(
     assert calls
     if n == 1:
         np.testing.assert_array_equal(run(1, alone=monkeypatch, **options), fast)
-    with kernels.never_compiled():
+    with kernels.plain_python():
         calls.clear()
         plain = run(n, threads, **options)
         assert not calls
@@ -181,7 +170,6 @@ class Reacher:
         return np.array(rows)
 
 
-@pytest.mark.usefixtures("compiled")
 @each_case(
     "options",
     [
@@ -201,14 +189,13 @@ def test_frames_of_arms_are_the_bits_of_ticks_and_steps_in_turns(
     assert len(calls) >= 44
     if n == 1:
         np.testing.assert_array_equal(Reacher(1, threads, options, monkeypatch).run(), fast)
-    with kernels.never_compiled():
+    with kernels.plain_python():
         calls.clear()
         plain = Reacher(n, threads, options).run()
         assert not calls
     np.testing.assert_array_equal(fast, plain)
 
 
-@pytest.mark.usefixtures("compiled")
 def test_physics_that_diverges_is_found() -> None:
     simulation = make(3)
     simulation.world.qvel[1, 0] = 1e300
@@ -231,7 +218,6 @@ class Between:
         self.plant.write(ctrl)
 
 
-@pytest.mark.usefixtures("compiled")
 def test_a_plant_that_is_put_in_between_sees_every_write() -> None:
     simulation = make(1)
     simulation.cerebellum.plant = between = Between(simulation.plant)  # type: ignore[assignment]
@@ -286,7 +272,6 @@ def after(what: str) -> NDArray[np.float64]:
 
 
 @pytest.mark.law
-@pytest.mark.usefixtures("compiled")
 @each_case(
     "what",
     [
@@ -296,14 +281,13 @@ def after(what: str) -> NDArray[np.float64]:
 )
 def test_whatever_comes_between_two_ticks_that_run_alone_it_counts_at_once(what: str) -> None:
     fast = after(what)
-    with kernels.never_compiled():
+    with kernels.plain_python():
         np.testing.assert_array_equal(fast, after(what))
 
 
 FIELDS = ("xfrc_applied", "qacc_warmstart", "ncon", "xquat", "qfrc_bias", "actuator_force")
 
 
-@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 20])
 def test_whatever_is_read_of_a_world_the_physics_is_the_same(count: int) -> None:
     """Fields of the state, numbers, derived fields, and more of these than frames copy."""
@@ -323,13 +307,12 @@ def test_whatever_is_read_of_a_world_the_physics_is_the_same(count: int) -> None
         return [simulation.world.qpos.copy(), *(field.copy() for field in bound.values())]
 
     fast = seen()
-    with kernels.never_compiled():
+    with kernels.plain_python():
         plain = seen()
     for one, other in zip(fast, plain, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.usefixtures("compiled")
 def test_what_a_subclass_does_after_steps_is_done() -> None:
     class Counting(Simulation):
         steps = 0
@@ -345,7 +328,6 @@ def test_what_a_subclass_does_after_steps_is_done() -> None:
     simulation.close()
 
 
-@pytest.mark.usefixtures("compiled")
 def test_after_an_interruption_the_next_frame_waits_for_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = make(4, 2)
     simulation.step(np.zeros((4, 2)))
@@ -372,7 +354,6 @@ def test_after_an_interruption_the_next_frame_waits_for_the_last(monkeypatch: py
     simulation.close()
 
 
-@pytest.mark.usefixtures("compiled")
 def test_closing_ends_the_threads() -> None:
     before = threading.active_count()
     simulation = make(4, 3)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.geometry.chain import find_frames, find_jacobian, solve
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
-from bhd_lerobot.control.kernels import as_objects, clamp, is_worth_compiling, kernel
+from bhd_lerobot.control.kernels import clamp, kernel
 from bhd_lerobot.control.record import ARM, GEOMETRY, JOINTS
 
 Array = NDArray[np.float64]
@@ -37,7 +37,6 @@ _DAMPING, _LEAST, _MOST = 1e-3, 1e-13, 1e6  # times the length squared
 _EASIER, _HARDER = 0.1, 6.0
 _DONE = 1e-11  # [m] and times the length [rad]: it is there
 _STILL, _NEARLY = 1e-9, 1e-4  # [rad] a step that is shorter than this is none; and before the last descent
-_VALUES_PER_STEP = 400  # that a step in Python counts for
 
 
 class NumericInverse:
@@ -62,8 +61,7 @@ class NumericInverse:
         self._tools, self._squares = tools, np.square(tools).sum(axis=1)
         self._geometry = np.zeros(1, GEOMETRY)
         forward.fill(self._geometry[0])
-        self._handled = 0
-        find_posture.bind()  # on the wall clock it is compiled now, not for the first goal
+        find_posture.load()  # now, and not for the first goal on the wall clock
 
     def starts(self, pose: Array, posture: Array) -> Array:
         """Return postures to start from, the most promising first, shape (MOST_STARTS, dof)."""
@@ -89,14 +87,9 @@ class NumericInverse:
         found, off = starts.copy(), np.empty((len(starts), 3))
         lower, upper = (self._lower, self._upper) if limited else (self._unlimited[0], self._unlimited[1])
         room, tool = np.zeros((2 * JOINTS + 3, JOINTS)), np.zeros((3, 4))  # new ones: threads may share the arm
-        arm, geometry, find = np.zeros(1, ARM), self._geometry, find_posture.function
-        if compiled := is_worth_compiling(find_posture, self._handled):
-            find = find_posture.compiled
-        else:
-            arm, geometry = as_objects(arm), as_objects(geometry)
+        arm, geometry = np.zeros(1, ARM), self._geometry
         for q, miss in zip(found, off, strict=True):
-            steps = find(q, posture, target, lower, upper, self._length, room, tool, miss, arm, geometry)
-            self._handled += 0 if compiled else _VALUES_PER_STEP * steps
+            find_posture.run(q, posture, target, lower, upper, self._length, room, tool, miss, arm, geometry)
         return found, off
 
     def reaches(self, off: Array) -> NDArray[np.bool_]:

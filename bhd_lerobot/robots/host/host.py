@@ -69,10 +69,7 @@ class Host:
         self.body = body = body if config.jerk_limits else without_jerk_limits(body)
         self.parts: list[Part] = self._make_parts(planning)
         sensors = sum(part.sensors for part in self.parts)
-        is_framed = self.world is not None
-        self.cerebellum = Cerebellum(
-            body, plant, config.control_hz, _one(self.parts), sensors=sensors, is_framed=is_framed
-        )
+        self.cerebellum = Cerebellum(body, plant, config.control_hz, _one(self.parts), sensors=sensors)
         self.bridge = LockstepBridge(self.cerebellum, self.rates, self.advance, self.run_ticks)
         self.action_names = tuple(name for part in self.parts for name in part.action_names)
         self.observation_names = tuple(name for part in self.parts for name in part.observation_names)
@@ -234,6 +231,10 @@ class Host:
     def stop(self, ids: NDArray[np.intp]) -> None:
         """Leave robots alone from now on: their episodes are over."""
         self.running[ids] = False
+
+    def load(self) -> None:
+        """Load the machine code that ticks run, before a loop on the wall clock begins."""
+        self.cerebellum.load()
 
     # --- frames ------------------------------------------------------------------------------------------------------
 

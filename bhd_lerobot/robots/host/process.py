@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from bhd_lerobot.bodies.body import Body, Rates
-from bhd_lerobot.control.kernels import compile_at_once
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
@@ -123,6 +122,7 @@ class LiveProcess:
         self._host: Host = spec.make_host(self._plant, planning=planning)
         cerebellum = self._host.cerebellum
         cerebellum.fifo, cerebellum.estop = self._block.fifo, self._block.estop
+        self._host.load()
         self._requests = RequestServer(cerebellum, self._block.requests, self._block.events)
         self._publisher = StatePublisher(
             self._host, self._block.ring, age_ns=self._age_ns if self._plant else None, problem=self._problem
@@ -261,7 +261,6 @@ def main() -> int:
     # Keys of the terminal are for the brain's process, which decides what becomes of the robot.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     spec: LiveSpec = connection.recv()
-    compile_at_once()
     try:
         with Privileges() as privileges:
             process = LiveProcess(spec, connection)

@@ -243,6 +243,10 @@ class Simulation(Host):
         self.tick += 1
         self._after_tick()
 
+    def load(self) -> None:
+        """Load the machine code that ticks run; with that of frames, those of the control alone are not."""
+        self.cerebellum.load(with_ticks=not (self._is_plain and self._frames.load()))
+
     def run_tick(self, now_ns: int, ticks: int) -> None:
         """Run one tick of control, and let the world go on by some, see `Host.run_tick`."""
         if not (self._is_plain and self._active is None and self._frames.tick(now_ns)):

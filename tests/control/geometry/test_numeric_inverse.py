@@ -17,8 +17,8 @@ from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
-from bhd_lerobot.control.geometry.numeric_inverse import NumericInverse, find_posture
-from bhd_lerobot.control.kernels import never_compiled
+from bhd_lerobot.control.geometry.numeric_inverse import NumericInverse
+from bhd_lerobot.control.kernels import plain_python
 from bhd_lerobot.sim.chain import chain_from_mjcf
 from tests.control.geometry.arm_models import serial
 
@@ -60,7 +60,6 @@ def off(kinematics: ForwardKinematics, q: Array, pose: Array) -> tuple[float, fl
 def test_a_line_begins_at_a_posture_whatever_array_that_is_a_part_of() -> None:
     """The end of a brake is a row of a trajectory whose columns are joints."""
     kinematics = arm(6)
-    assert find_posture.compiled
     (start,) = postures(kinematics, 1)
     poses = np.stack([kinematics.tool(start)] * 3)
     part = np.repeat(start, 2)[::2]
@@ -246,11 +245,10 @@ def test_a_pose_that_cannot_be_taken_says_why(joints: int) -> None:
 def test_machine_code_finds_the_same_postures_as_python() -> None:
     kinematics = arm(6)
     numeric = NumericInverse(kinematics, kinematics.lower, kinematics.upper)
-    assert callable(find_posture.compiled)
     for q, start in zip(postures(kinematics, 3), postures(kinematics, 3, 1), strict=True):
         arguments = kinematics.tool(q), start, np.stack([start, q + 0.1])
         machine = numeric.descend(*arguments)
-        with never_compiled():
+        with plain_python():
             plain = numeric.descend(*arguments)
         np.testing.assert_array_equal(machine[0], plain[0])
         np.testing.assert_array_equal(machine[1], plain[1])
