@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -27,11 +28,11 @@ def add_faults(parser: argparse.ArgumentParser) -> Any:
     faults = parser.add_argument_group("faults")
     for name, kind, text in (
         ("--gap", "TOPIC:START:DURATION", "nothing is published for a time"),
-        ("--silence", "TOPIC:START", "nothing is published any more"),
         ("--nan", "TOPIC:START:DURATION", "numbers are NaN for a time"),
         ("--swap", "TOPIC:EVERY", "each so many messages, one is published after its successor"),
     ):
         faults.add_argument(name, action="append", default=[], type=at(kind), metavar=kind, help=text)
+    faults.add_argument("--silence", metavar="TOPIC", help="nothing is published any more after SIGUSR1")
     faults.add_argument("--zero-stamp", action="append", default=[], metavar="TOPIC", help="no time in the header")
     faults.add_argument("--repeat", type=float, default=math.inf, help="times begin anew each so many seconds")
     return faults
@@ -57,7 +58,9 @@ class Outlet:
             return [rest for name, *rest in faults if name in names]
 
         self.clock = lambda: clock() % args.repeat
-        self.gaps = [*mine(args.gap), *((start, math.inf) for (start,) in mine(args.silence))]
+        self.gaps = mine(args.gap)
+        if args.silence in names:
+            signal.signal(signal.SIGUSR1, lambda *_: self.gaps.append((0.0, math.inf)))
         self.nans = mine(args.nan)
         self.frame = frame
         self.has_stamp = not set(names) & set(args.zero_stamp)

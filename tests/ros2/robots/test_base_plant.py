@@ -151,10 +151,11 @@ def test_another_robot_of_its_name_another_node_that_commands_it_and_a_guard_tha
 
 def test_a_silent_topic_and_a_robot_that_is_gone_are_named(domain: int) -> None:
     plant = make(domain, silence_s=2.0)
-    with Peer("standin_turtlebot3.py", "--silence=scan:6", domain=domain) as robot:
+    with Peer("standin_turtlebot3.py", "--silence=scan", domain=domain) as robot:
         robot.wait_event("ready")
         try:
             plant.open()
+            robot.signal(signal.SIGUSR1)
             fails(plant, "/scan has sent no message for")
             robot.signal(signal.SIGKILL)
             gone = ("/joint_states has sent no message for", "Nobody publishes /joint_states")
