@@ -58,6 +58,7 @@ class Cerebellum:
 
     Attributes:
         states: the records of the robots, shape (n,): see `record`.
+        robots: what ticks work on, as kernels take it; another one if `fifo` or `estop` is replaced.
         numbers: the record of their limits, shape (1,).
         written: what is written to the plant, shape (n, actuators).
         efforts: torques of the joints [N m], a gripper's force [N], as they were measured; where the plant does not
@@ -122,13 +123,12 @@ class Cerebellum:
         self._tick_all = tick_bases if controller.springs is None else tick_springs
         if controller.arms is not None:
             self._tick_all = tick_arms if controller.monitors is None else tick_mobile_arms
+        self._group()
         self._start_writing(np.arange(n))
 
-    @property
-    def robots(self) -> Robots:
-        """What ticks work on, as kernels take it."""
+    def _group(self) -> None:
         queues, words, reading = self._fifo.queues, self._estop.words, self.reading
-        return Robots(self.states, queues, words, self.numbers, reading.sensors, reading.sensors_ns)
+        self.robots = Robots(self.states, queues, words, self.numbers, reading.sensors, reading.sensors_ns)
 
     def load(self, *, with_ticks: bool = True) -> None:
         """Load the machine code of its calls, which is compiled if the cache has none, before a loop begins.
@@ -148,6 +148,7 @@ class Cerebellum:
     def fifo(self, fifo: CommandFifo) -> None:
         self._fifo = fifo
         self.states["seen_head"] = -1
+        self._group()
 
     @property
     def estop(self) -> EstopWord:
@@ -157,6 +158,7 @@ class Cerebellum:
     @estop.setter
     def estop(self, estop: EstopWord) -> None:
         self._estop = estop
+        self._group()
 
     @property
     def stamp_origin_ns(self) -> int:
@@ -194,8 +196,8 @@ class Cerebellum:
     def _tick(self, now_ns: int) -> None:
         self.now_ns = now_ns
         self._read()
-        robots, own, goes_on = self.robots, self.controller, False
-        while not self._tick_all.run(robots, *own.parts, now_ns, goes_on):
+        goes_on = False
+        while not self._tick_all.run(self.robots, *self.controller.parts, now_ns, goes_on):
             self.serve()
             goes_on = True
         if np.count_nonzero(self._mode_is_new):

@@ -78,6 +78,16 @@ class Kernel[**P, R]:
             return python(*map(as_objects, arguments))
         return self.compiled(*arguments)
 
+    @cached_property
+    def unchecked(self) -> Callable[..., R]:
+        """The machine code without the check of its arguments' types, which takes several times as long as the call.
+
+        For a caller that has called `compiled` with these arguments, or with others of the same types.
+        """
+        one: Any = self.compiled
+        entry: Callable[..., R] = one.overloads[one.signatures[0]].entry_point
+        return entry
+
     def load(self) -> None:
         """Compile it now, or load it, and not when it is first run: before a loop on the wall clock begins."""
         if not _is_plain:

@@ -590,7 +590,7 @@ class Frames:
         delay = self._at_once
         if late is not None and late.is_late:
             delay = Delay(late.ring, late.latency, late.waited, late.written)
-        return self._world.warnings, own.robots, monitors, arms, springs, brakes, delay
+        return own.robots, monitors, arms, springs, brakes, delay
 
     @property
     def _are_copied(self) -> bool:
@@ -653,14 +653,15 @@ class _Thread:
             layouts=layout.copy(),
         )
         self._outputs = 0
+        self._checked: Robots | None = None  # those whose arrays' types were checked
         self._lock = Lock()  # after an interruption the last frame may still be running
 
-    def run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, *parts: Any) -> None:
+    def run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, robots: Robots, *parts: Any) -> None:
         """Let ticks of some simulations go by."""
         with self._lock:
-            self._run(one, ids, ticks, *parts)
+            self._run(one, ids, ticks, robots, *parts)
 
-    def _run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, *parts: Any) -> None:
+    def _run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, robots: Robots, *parts: Any) -> None:
         outputs = self._world.outputs
         if len(outputs) != self._outputs:
             row = self._physics.layouts[0]
@@ -668,4 +669,6 @@ class _Thread:
                 row["source"][k], row["target"][k] = getattr(self._data, name).ctypes.data, target.ctypes.data
                 row["nbytes"][k] = target[0].nbytes
             self._outputs = row["outputs"] = len(outputs)
-        one.compiled(ids, ticks, self._physics, self._warnings, *parts)
+        call = one.unchecked if robots is self._checked else one.compiled
+        call(ids, ticks, self._physics, self._warnings, self._world.warnings, robots, *parts)
+        self._checked = robots
