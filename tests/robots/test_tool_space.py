@@ -50,7 +50,7 @@ def test_the_observed_tool_pose_is_that_of_the_observed_joints_with_their_noise(
     scenes = [TableScene("empty", (), arm.body.arm.home, variation=variation) for variation in (Variation(), noisy)]
     arm.reset(np.arange(2), scenes, [0, 1])
     arm.step(np.repeat(arm.cerebellum.command[:1], 2, axis=0))
-    state, _ = arm.sense()
+    state = arm.observe().state
     names = list(arm.observation_names)
     assert names[-7:] == list(TOOL_NAMES[:-1])
     assert state.shape == (2, len(names))

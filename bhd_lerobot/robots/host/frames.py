@@ -25,7 +25,9 @@ def frame_of(mirror: Host, state: Any, seen_ns: int, origin_ns: int) -> Frame:
     sensed = int(state["sensed_ns"])
     age = max(0, seen_ns - sensed) + int(state["oldest_ns"])
     physics = {keys.PHYSICS_STATE: state["physics"].copy()} if mirror.world is not None else {}
-    return Frame(state["observation"].copy(), np.array([sensed - origin_ns]), np.array([age]), physics)
+    return Frame(
+        mirror.completed(state["observation"].copy()), np.array([sensed - origin_ns]), np.array([age]), physics
+    )
 
 
 def report_of(

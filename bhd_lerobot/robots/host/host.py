@@ -48,6 +48,7 @@ class Host:
         bridge: how commands get to the cerebellum.
         action_names: names of the action's floats, in order.
         observation_names: names of the observation's floats, in order.
+        sensed_names: those that do not follow from others.
         running: which robots are in an episode, shape (n,).
         tick: control ticks that have gone by.
         world: the simulated world, which can be placed, stored and rendered; None of a real robot.
@@ -79,10 +80,13 @@ class Host:
         self.sensor_period_s = max(part.sensor_period_s for part in self.parts)
         for part in self.parts:
             part.host = self
-        self._observed, self._actions, self._commands = (
+        sensed = [part.observation_names[: len(part.observation_names) - part.derived] for part in self.parts]
+        self.sensed_names = tuple(name for names in sensed for name in names)
+        self._observed, self._sensed, self._actions, self._commands = (
             _places(widths)
             for widths in (
                 [len(part.observation_names) for part in self.parts],
+                [len(names) for names in sensed],
                 [len(part.action_names) for part in self.parts],
                 [part.controller.width for part in self.parts],
             )
@@ -140,17 +144,28 @@ class Host:
         return self.cerebellum.reading
 
     def sense(self, out: NDArray[np.float64] | None = None) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the observation's floats, shape (n, features), and the tick of the oldest reading, shape (n,).
+        """Return what is sensed, shape (n, `sensed_names`), and the tick of the oldest reading, shape (n,).
 
         Args:
             out: where the floats are written; a new array if None.
         """
-        out = np.empty((self.n, len(self.observation_names))) if out is None else out
+        out = np.empty((self.n, len(self.sensed_names))) if out is None else out
         reading = self.read()
-        for part, columns in zip(self.parts, self._observed, strict=True):
+        for part, columns in zip(self.parts, self._sensed, strict=True):
             part.sense(reading, out[:, columns])
         oldest = [part.oldest() for part in self.parts]
         return out, oldest[0] if len(oldest) == 1 else np.minimum.reduce(oldest)
+
+    def completed(self, sensed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the observation's floats, shape (n, features), from what is sensed."""
+        if len(self.sensed_names) == len(self.observation_names):
+            return sensed
+        out = np.empty((len(sensed), len(self.observation_names)))
+        for part, columns, ours in zip(self.parts, self._observed, self._sensed, strict=True):
+            values = out[:, columns]
+            values[:, : ours.stop - ours.start] = sensed[:, ours]
+            part.derive(values)
+        return out
 
     def truth(self) -> Any:
         """Return what a task judges by, as far as it is known; touches since the start of the last frame."""
@@ -240,11 +255,11 @@ class Host:
 
     def observe(self) -> Frame:
         """Return what the robots see now."""
-        state, oldest = self.sense()
+        sensed, oldest = self.sense()
         now = (self.tick - self._start_tick) * NANOSECONDS // self.rates.control_hz
         measured = (oldest - self._start_tick) * NANOSECONDS // self.rates.control_hz
         physics = {keys.PHYSICS_STATE: self.physics_state} if self.world is not None else {}
-        return Frame(state, now, now - measured, physics)
+        return Frame(self.completed(sensed), now, now - measured, physics)
 
     def step(self, command: Command) -> FrameReport:
         """Send a command to the running robots and let one frame go by."""

@@ -72,7 +72,7 @@ class LiveLink:
             "control_hz": rates.control_hz,
             "actions": list(mirror.action_names),
             "commands": list(mirror.body.limits.names),
-            "observations": list(mirror.observation_names),
+            "observations": list(mirror.sensed_names),
             "drives": mirror.body.drive is not None,
             "brain_pid": os.getpid(),
         }

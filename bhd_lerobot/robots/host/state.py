@@ -44,7 +44,7 @@ def published(host: Host) -> dict[str, tuple[Any, tuple[int, ...], str]]:
         "limits": (np.int64, (len(LIMITS),), "how often each of `LIMITS` changed a command"),
         "watchdogs": (np.int64, (len(WATCHDOGS),), "how often each of `WATCHDOGS` noticed something"),
         "touches": (np.int64, (len(host.touches),), "ticks with a touch, by kind"),
-        "observation": (np.float64, (1, len(host.observation_names)), "the observation's floats"),
+        "observation": (np.float64, (1, len(host.sensed_names)), "what is sensed of the observation"),
         "physics": (np.float64, (1, physics), "the simulator's generalised positions and velocities"),
         "feedback": (FEEDBACK_DTYPE, (), "how far the goal is that is followed, once a frame"),
         "problem": (f"S{_PROBLEM_BYTES}", (), "what is wrong in FAULT, in UTF-8"),

@@ -71,6 +71,7 @@ class ArmPart(Part):
         self.config, self.kinematics = config, ArmKinematics(arm.chain, arm.limits)
         self.action_names, self.observation_names = arm_action_names(config, body), arm_observation_names(config, body)
         self._joints, self._values = len(arm.chain.joints), len(arm.limits.names)
+        self.derived = len(self.observation_names) - 2 * self._values
         ticks = config.rates.ticks_per_frame
         self.controller: ArmController | ImpedanceController
         if config.control == "impedance":
@@ -97,14 +98,14 @@ class ArmPart(Part):
         self._refused = np.zeros(plant.n, np.bool_)  # the last action
 
     def sense(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
-        """Write its observation's floats, shape (n, features): with the tool's pose if asked for."""
-        self._sense_joints(reading, out)
-        if self.config.tool_pose:
-            out[:, 2 * self._values :] = pose_vectors(self.kinematics.tool(out[:, : self._joints]))
-
-    def _sense_joints(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        """Write positions and speeds of the joints."""
         values = self._values
         out[:, :values], out[:, values : 2 * values] = reading.position[:, :values], reading.velocity[:, :values]
+
+    def derive(self, out: NDArray[np.float64]) -> None:
+        """Write the tool's pose if asked for."""
+        if self.derived:
+            out[:, 2 * self._values :] = pose_vectors(self.kinematics.tool(out[:, : self._joints]))
 
     def truth(self, reading: PlantReading) -> dict[str, Any]:
         """Return what the joints say: where the tools are. Of objects and touches nothing is known."""

@@ -25,7 +25,7 @@ class Part(ABC):
     Attributes:
         controller: turns its commands into actuator commands.
         action_names: names of its actions, in order.
-        observation_names: names of the floats that it observes, in order.
+        observation_names: names of the floats that it observes, in order; the last `derived` follow from the others.
         sensors: how many of `PlantReading.sensors` are its.
         knows: the fields of a task's truth that it measures itself.
         sensor_period_s: time between two readings of its slowest sensor [s]; 0 if all are read at every tick.
@@ -36,6 +36,7 @@ class Part(ABC):
     controller: Controller
     action_names: tuple[str, ...]
     observation_names: tuple[str, ...]
+    derived = 0
     sensors = 0
     knows: frozenset[str] = frozenset()
     sensor_period_s = 0.0
@@ -44,7 +45,11 @@ class Part(ABC):
 
     @abstractmethod
     def sense(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
-        """Write its observation's floats, shape (n, features); `reading` is the robot's."""
+        """Write its observation's floats but the derived ones, shape (n, features); `reading` is the robot's."""
+
+    def derive(self, out: NDArray[np.float64]) -> None:
+        """Write the derived floats of its observation, shape (n, features), of which the others are there."""
+        return
 
     def oldest(self) -> NDArray[np.int64]:
         """Return the tick of its oldest reading, shape (n,)."""

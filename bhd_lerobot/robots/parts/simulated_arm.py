@@ -69,8 +69,9 @@ class SimulatedArm(ArmPart, SimulatedPart):
             "fingers_on_object": np.array(self.table.finger_on_object),
         }
 
-    def _sense_joints(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
-        super()._sense_joints(reading, out)
+    def sense(self, reading: PlantReading, out: NDArray[np.float64]) -> None:
+        """Write positions and speeds of the joints, with their noise."""
+        super().sense(reading, out)
         if np.count_nonzero(self._noise):
             joints, speeds = self._joints, slice(self._values, self._values + self._joints)
             for sim in np.flatnonzero((self._noise > 0) & self.host.running):

@@ -40,7 +40,7 @@ class BaseTopics(Topics):
         lidar = body.need(LidarSpec)
         self._host, self._view, self._drive = host, view, body.need(Drive)
         beams = host.config.beams
-        names = list(host.observation_names)
+        names = list(host.sensed_names)
         self._gyro = [names.index(name) for name in GYRO]
         self._ranges = slice(names.index("scan_000.pos"), names.index("scan_000.pos") + beams)
         self._scan_part = ScanPart("/scan", tuple(names[self._ranges]), lidar=lidar)
