@@ -121,6 +121,7 @@ class _Arm(RobotFile):
         for kind in (spec.keys, spec.sensors, spec.lights, spec.actuators):
             for one in list(kind):
                 spec.delete(one)
+        unit = np.pi / 180 if spec.compiler.degree else 1.0  # of the file's angles
         for joint in list(spec.joints):
             if joint.name not in kept:
                 spec.delete(joint)
@@ -129,7 +130,7 @@ class _Arm(RobotFile):
                 joint.damping = 0.0 if np.isscalar(joint.damping) else [0.0] * len(joint.damping)
                 if self.file.servos:
                     joint.frictionloss = self.servos[number].friction
-                joint.range, joint.limited = [self.lower[number], self.upper[number]], True
+                joint.range, joint.limited = [self.lower[number] / unit, self.upper[number] / unit], True
                 if not joint.armature and not self.servos[number].stiffness:
                     joint.armature = _ROTOR * self.servos[number].effort
         sky = int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)

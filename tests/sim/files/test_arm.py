@@ -127,8 +127,11 @@ def test_however_the_file_is_written_it_is_the_same_arm(tmp_path: Path) -> None:
     degrees = degrees.replace('euler="0 -0.1745 0"', 'euler="0 -9.998 0"').replace(
         'euler="0 0.11 0"', 'euler="0 6.303 0"'
     )
-    turned = arm_body(written(tmp_path, degrees, "degrees.xml")).need(Arm)
+    body = arm_body(written(tmp_path, degrees, "degrees.xml"))
+    turned, model = body.need(Arm), World(body).model
     np.testing.assert_allclose(turned.limits.upper, plain.limits.upper, atol=1e-5)
+    ends = [model.joint(name).range[1] for name in turned.chain.joints]
+    np.testing.assert_allclose(ends, turned.limits.upper[: len(ends)], atol=1e-9)
 
 
 @each_case(
