@@ -104,11 +104,12 @@ class Committer:
         staging = root / layout.STAGING / "save"
         self._disk.make_folder(staging)
         self._disk.write(staging / "info.json", self._info_text(info))
+        self._stage(staging / "tasks.parquet", tasks_table(tasks))  # a full disk ends here
         self._disk.move(staging / "info.json", root / layout.INFO)
         if tasks:
-            self._disk.move(self._stage(staging / "tasks.parquet", tasks_table(tasks)), root / layout.TASKS)
+            self._disk.move(staging / "tasks.parquet", root / layout.TASKS)
         else:
-            (root / layout.TASKS).unlink()
+            self._disk.remove(root / layout.TASKS)
 
     def _stage(self, path: Path, table: pa.Table, **options: Any) -> Path:
         sink = pa.BufferOutputStream()

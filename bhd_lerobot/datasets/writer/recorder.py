@@ -241,6 +241,7 @@ class DatasetRecorder:
                 self._before = dict(self._state.info), list(self._state.tasks)
                 self._state = self._committer.commit(self._state, content)
         except BaseException as error:
+            self._before = None  # whether there is an episode more, the disk says
             episode.discard()
             if isinstance(error, Exception):
                 with contextlib.suppress(OSError):
@@ -256,17 +257,18 @@ class DatasetRecorder:
 
         Raises:
             DatasetError: nothing was saved, or the last save was taken back already.
-            DatasetWriteError: the disk refused it; the episode is still there.
+            DatasetWriteError: the disk refused it; where it did so at the end, the episode is gone all the same.
         """
         self._check_not_finalized()
         before, self._before = self._before, None
         if before is None:
             raise DatasetError("There is no episode of this recording that can be taken back.")
         self._settle_if_is_uncertain()
+        self._is_uncertain = True
         with write_errors("take back the last episode", self.root, _INTACT):
             self._committer.take_back(self.root, *before)
             # What is not counted any more is dropped as after a kill in the middle of a save.
-            self._state, _ = restore_committed(self.root, self._disk, keep_staging=True)
+            self._settle_if_is_uncertain()
         self._stats.pop(self.num_episodes, None)
 
     def finalize(self) -> None:

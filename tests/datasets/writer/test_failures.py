@@ -66,6 +66,9 @@ def test_a_disk_that_fails_at_any_step_of_a_save(tmp_path: Path, monkeypatch: py
                 failure = str(error)
         done = len(seen) <= step
         assert failure is None or ("No space left on device" in failure and "Free some space" in failure)
+        if failure is not None:
+            with pytest.raises(DatasetError, match="no episode of this recording that can be taken back"):
+                recorder.drop_last()  # which would be the one before, or none
         # Only an episode whose commit had happened may be there although the call failed, in the clean-up after it.
         assert recorder.num_episodes in (saved, saved + 1)
         if not done:
@@ -91,6 +94,30 @@ def test_an_interrupt_at_any_step_of_a_save(tmp_path: Path, monkeypatch: pytest.
         assert not repair(root)
         step += 1
     assert support.read_back(root) == 2
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")], ids=str)
+def test_a_failure_at_any_step_of_taking_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    """Leaving the block finalises what the disk says: the last episode is there or not, and nothing is corrupted."""
+    step, done = 0, False
+    while not done:
+        root = tmp_path / str(step)
+        with support.create(root) as recorder:
+            for _ in range(2):
+                support.record(recorder)
+            with (
+                stop_at(monkeypatch, step, error) as seen,
+                contextlib.suppress(KeyboardInterrupt, DatasetWriteError),
+            ):
+                recorder.drop_last()
+            done = len(seen) <= step
+        assert support.read_back(root) in (1, 2)
+        assert not repair(root)
+        step += 1
+    assert support.read_back(root) == 1
 
 
 @contextlib.contextmanager
