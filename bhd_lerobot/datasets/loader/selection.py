@@ -186,20 +186,18 @@ def frame_weights(
             f"and of learners at 1. It has: {', '.join(meta.features)}."
         )
     table = FrameTable.open(meta, episodes, [EVENT])
-    events = table.columns[EVENT]
-    weights = torch.ones(len(events))
-    if learner != 1:
-        of_episode, frame = table.columns["episode_index"], table.columns["frame_index"]
-        name = f"{PREFIX}interventions"
-        stored = meta.episodes[name] if name in meta.episodes.column_names else []
-        for episode in torch.unique(of_episode).tolist() if stored else []:
-            if not stored[episode]:
-                continue  # nobody could intervene; where nobody did, there is an empty list
-            mine = of_episode == episode
-            for first, end, _ in json.loads(stored[episode]):
-                mine &= (frame < first) | (frame >= end)
-            weights[mine] = learner
-    weights[events == int(Event.INTERVENTION)] = intervention
+    weights = torch.ones(len(table))
+    driven = table.columns[EVENT] == int(Event.INTERVENTION)
+    name = f"{PREFIX}interventions"
+    stored = meta.episodes[name] if name in meta.episodes.column_names else []
+    for episode in table.episodes if stored else ():
+        if not stored[episode]:
+            continue  # nobody could intervene; where nobody did, there is an empty list
+        rows = table.rows(episode)
+        weights[rows] = learner
+        for first, end, _ in json.loads(stored[episode]):  # also the last frame, whose event is what ended the episode
+            driven[rows][first:end] = True
+    weights[driven] = intervention
     return None if bool((weights == 1).all()) else weights
 
 

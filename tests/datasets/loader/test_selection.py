@@ -1,5 +1,6 @@
 """Which episodes and frames are learned from, and what a dataset must not lack."""
 
+import json
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from bhd_lerobot.datasets.loader.loader import (
     split_episodes,
 )
 from bhd_lerobot.datasets.loader.table import open_metadata
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError
 from tests.cases import each_case
 from tests.datasets.loader import support
@@ -127,6 +129,25 @@ def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> No
     assert sorted(drawn.tolist()) == [i for i in range(meta.total_frames) if i != place]
     with pytest.raises(DatasetError, match="no column 'event'"):
         frame_weights(open_metadata(foreign), None, intervention=0.0)
+
+
+@each_case(("intervention", "learner"), [(0.0, 1.0), (3.0, 1.0), (1.0, 0.5), (2.0, 0.0)])
+def test_an_intervention_that_lasts_to_the_end_counts_to_the_end(
+    tmp_path: Path, intervention: float, learner: float
+) -> None:
+    """The event of the last frame is what ended the episode, whoever drove; `bhd/interventions` says who did."""
+    events, spans = [0, 0, 5, 5, 1], [[[2, 5, "no progress"]], [], None]
+    features = {key: support.FEATURES[key] for key in ("action", "event")}
+    with DatasetRecorder.create("t/t", 10, features, root=tmp_path / "d", robot_type="r") as recorder:
+        for driven in spans:
+            writer = recorder.begin_episode()
+            event = np.array(events if driven else [0, 0, 0, 0, 1])
+            writer.set_columns({"action": np.zeros((5, 2), np.float32), "event": event})
+            stored = "" if driven is None else json.dumps(driven)
+            recorder.save(writer, task="t", metadata={"interventions": stored})
+    weights = frame_weights(open_metadata(tmp_path / "d"), None, intervention=intervention, learner=learner)
+    assert weights is not None
+    assert weights.tolist() == [*[learner] * 2, *[intervention] * 3, *[learner] * 5, *[1.0] * 5]
 
 
 KEYS = ["observation.state", "action"]
