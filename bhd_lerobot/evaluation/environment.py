@@ -29,7 +29,7 @@ from bhd_lerobot.evaluation.metrics import EnvironmentMetrics
 from bhd_lerobot.evaluation.report import NO_SUCCESS, ReportInput
 from bhd_lerobot.evaluation.results import ENVIRONMENT_MEANS, summarise
 from bhd_lerobot.options.command import Program
-from bhd_lerobot.options.declared import Count, Share, Whole
+from bhd_lerobot.options.declared import Count, LibrarySeed, Share
 from bhd_lerobot.options.parse import CommandLine, choices_of, decode, encode
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.learned.brain import LearnedBrainConfig
@@ -65,7 +65,7 @@ class EnvironmentEvalConfig(Comparison):
     brain: BrainConfig | None = None
     only: list[str] | None = None
     n_episodes: Count = 100
-    seed: Whole = 0
+    seed: LibrarySeed = 0
     baseline: str | None = None
     n_envs: Count = 16
     fail_below: Share | None = None

@@ -25,7 +25,7 @@ class Range:
         self._above, self._below = found[1] == "(", found[4] == ")"
 
     def __str__(self) -> str:
-        low, high = f"{self.low:.6g}", f"{self.high:.6g}"
+        low, high = f"{self.low:.10g}", f"{self.high:.10g}"
         if self.low == -math.inf:
             return "finite"
         if self.high == math.inf:
@@ -70,6 +70,8 @@ Finite = Annotated[float, Range("(-inf, inf)")]
 Share = Annotated[float, Range("[0, 1]")]
 Count = Annotated[int, Range("[1, inf]")]
 Whole = Annotated[int, Range("[0, inf]")]
+LibrarySeed = Annotated[int, Range("[0, 4294967295]")]
+"""A seed that NumPy's global generator takes, too, as it is in LeRobot and Stable-Baselines3."""
 
 
 class Options:

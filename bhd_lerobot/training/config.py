@@ -15,7 +15,17 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.selection import HOLD_OUTS, EpisodeFilter
 from bhd_lerobot.errors import ConfigError, quoted
-from bhd_lerobot.options.declared import Count, NotNegative, OneOf, Options, Range, Share, check_options
+from bhd_lerobot.options.declared import (
+    Count,
+    LibrarySeed,
+    NotNegative,
+    OneOf,
+    Options,
+    Range,
+    Share,
+    check_option,
+    check_options,
+)
 from bhd_lerobot.options.parse import encode
 
 OWN_CONFIG_NAME = "bhd_train.json"
@@ -102,6 +112,7 @@ class BhdTrainConfig(TrainPipelineConfig):
             ConfigError: names the value, and what would be valid.
         """
         check_options(self)
+        check_option("seed", self.seed, LibrarySeed)
         for name, value, least in (
             ("steps", self.steps, 1),
             ("log_freq", self.log_freq, 0),

@@ -196,6 +196,7 @@ def test_an_environment_that_fails_is_named_with_the_brain(finished, tmp_path, m
         ([*LINE, "--env.speed=1"], "Unknown option 'env.speed'"),
         ([*LINE, "--env.task=Lines-v0"], "env.type is 'line', which"),
         ([*LINE, "--videos=1"], "Unknown option 'videos'"),
+        ([*LINE, "--seed=4294967296"], "seed is 4294967296; it must be from 0 to 4294967295"),
         ([*LINE, "--brains.rule.type=noop"], "brains.rule.type is 'noop'; in an environment of LeRobot only policies"),
         ([*LINE, "--brain.stream=true"], "brains.learned.stream is True, which LeRobot's rollout does not have"),
         ([*LINE, "--brains.other.path=/nowhere"], "brains.other: There is no policy at '/nowhere'"),

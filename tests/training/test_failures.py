@@ -300,6 +300,7 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
         ({"stepps": 3}, r"stepps.*Did you mean 'steps'"),
         ({"steps": 0}, "steps is 0; it must be at least 1"),
         ({"steps": 2.5}, "steps is 2.5; it must be a whole number"),
+        ({"seed": 2**32}, "seed is 4294967296; it must be from 0 to 4294967295"),
         ({"batch_size": 0}, "batch_size is 0"),
         ({"budget_gib": 0}, "budget_gib is 0"),
         ({"threads": 0}, "threads is 0"),

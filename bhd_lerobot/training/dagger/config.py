@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options import parse as configuration
-from bhd_lerobot.options.declared import Count, OneOf, Options, Whole
+from bhd_lerobot.options.declared import Count, LibrarySeed, OneOf, Options, Whole
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.recording.config import RecordConfig
@@ -80,7 +80,7 @@ class AggregationConfig(Options):
     expert_episodes: Count = 400
     episodes: Count = 200
     validation_episodes: Count = 200
-    seed: Whole = 0
+    seed: LibrarySeed = 0
 
     @property
     def stages(self) -> tuple[StageConfig, ...]:

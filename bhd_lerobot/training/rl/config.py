@@ -10,7 +10,18 @@ from lerobot.utils.constants import CHECKPOINTS_DIR
 
 from bhd_lerobot.envs.register import ENVIRONMENTS
 from bhd_lerobot.errors import ConfigError, unknown_name
-from bhd_lerobot.options.declared import Count, Finite, NotNegative, OneOf, Options, Positive, Range, Share, Whole
+from bhd_lerobot.options.declared import (
+    Count,
+    Finite,
+    LibrarySeed,
+    NotNegative,
+    OneOf,
+    Options,
+    Positive,
+    Range,
+    Share,
+    Whole,
+)
 from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig, ScanConfig
@@ -194,7 +205,7 @@ class RlConfig(Options):
     critic_warmup: Whole = 0
     output_dir: str | None = None
     resume: bool = False
-    seed: Whole = 0
+    seed: LibrarySeed = 0
     threads: Count | None = None
 
     def __post_init__(self) -> None:

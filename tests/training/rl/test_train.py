@@ -270,6 +270,7 @@ def test_without_stable_baselines3_the_message_says_how_to_install_it(tmp_path, 
 
 WRONG: list[tuple[dict[str, object], str]] = [
     ({"steps": 0}, "steps is 0; it must be at least 1"),
+    ({"seed": 2**32}, "seed is 4294967296; it must be from 0 to 4294967295"),
     ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
     ({"reward__potential": "pose"}, "only a task with a target pose"),
     ({"algorithm": "sac"}, "Valid: ppo"),
