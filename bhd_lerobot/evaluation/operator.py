@@ -1,5 +1,6 @@
 """A person beside a real robot who sets up scenes and judges, and the order in which the brains run."""
 
+import contextlib
 import json
 import random
 import time
@@ -23,11 +24,14 @@ def drawn_orders(folder: Path, labels: Sequence[str], indices: Sequence[int]) ->
     """Return in which order the brains run each episode, by its number, as drawn when the evaluation in a folder began.
 
     An order that followed from the seed would be the same in every evaluation, and a person would come to know it.
+    What is left of an evaluation of other brains or episodes, or half written, is drawn anew.
     """
     path, chance = folder / "order.json", random.SystemRandom()
-    if path.is_file():
-        return dict(json.loads(path.read_text(encoding="utf-8")))
     orders = {str(index): chance.sample(labels, len(labels)) for index in indices}
+    with contextlib.suppress(OSError, ValueError, AttributeError, TypeError):
+        drawn = dict(json.loads(path.read_text(encoding="utf-8")))
+        if {index: sorted(order) for index, order in drawn.items()} == dict.fromkeys(orders, sorted(labels)):
+            return drawn
     write_json(path, orders)
     return orders
 

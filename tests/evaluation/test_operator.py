@@ -112,6 +112,12 @@ def test_the_order_is_a_permutation_for_each_episode_that_is_drawn_once_for_each
     # Each brain is as often the first as any other: 2000 of 6000, with a standard deviation of 37.
     assert all(abs(sum(order[0] == label for order in one.values()) - 2000) < 8 * 37 for label in labels)
     assert np.unique([", ".join(order) for order in one.values()]).size == 6
+    # What is left of an evaluation that was killed before its results were there, of other brains or episodes.
+    for left in (json.dumps(one), '{"0": ["a", "b"]}', '{"0": ["a"], "1": ["b"]}', '{"0": ["a",', "[]", "null"):
+        (folders[0] / "order.json").write_text(left)
+        drawn = drawn_orders(folders[0], ["b", "a"], range(2))
+        assert {number: sorted(order) for number, order in drawn.items()} == {"0": ["a", "b"], "1": ["a", "b"]}, left
+        assert drawn == drawn_orders(folders[0], ["b", "a"], range(2)), left
 
 
 def test_keys_judge_in_a_blinded_order_and_the_report_says_which_brain_it_was(tmp_path):
