@@ -16,8 +16,8 @@ from bhd_lerobot.options.parse import RUN_CONFIG, encode
 def run_folder(config: Any, kind: str, name: str = "") -> Iterator[Path]:
     """Make the folder of a run, with its resolved configuration; if the block fails, the run was refused.
 
-    A run that was refused leaves no folder; what was there before stays. The default place is in ``outputs/<kind>``, by
-    default with a name of robot and task.
+    A run that was refused leaves no folder; what was there before stays. The default place is a new folder in
+    ``outputs/<kind>``, by default with a name of robot and task.
     """
     if config.output_dir:
         folder = Path(config.output_dir).expanduser()
@@ -25,10 +25,9 @@ def run_folder(config: Any, kind: str, name: str = "") -> Iterator[Path]:
         now = datetime.now()
         name = name or f"{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
         folder = Path("outputs") / kind / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{name}"
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
+        folder, missing = _made(folder, is_new=not config.output_dir)
         before = (folder / RUN_CONFIG).read_bytes() if (folder / RUN_CONFIG).is_file() else None
-        folder.mkdir(parents=True, exist_ok=True)
         (folder / RUN_CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
@@ -43,3 +42,19 @@ def run_folder(config: Any, kind: str, name: str = "") -> Iterator[Path]:
             for path in missing:
                 path.rmdir()
         raise
+
+
+def _made(folder: Path, *, is_new: bool) -> tuple[Path, list[Path]]:
+    """Make a folder, or one beside it if it is to be new; return it, and what of its path was not there."""
+    place, number = folder, 1
+    while True:
+        missing = [path for path in (place, *place.parents) if not path.exists()]
+        try:
+            place.mkdir(parents=True, exist_ok=not is_new)
+        except FileExistsError:
+            if not is_new:
+                raise
+            number += 1  # another run began in the same second, or the clock was put back
+            place = folder.with_name(f"{folder.name}_{number}")
+        else:
+            return place, missing
