@@ -327,15 +327,15 @@ class EpisodeLoop:
     def _log(self, command: Command, report: FrameReport) -> None:
         """Remember goals and how they ended, for the episode's metadata and for the brain."""
         self._drivers.decided()
-        self._gives_goals = isinstance(command, Goals)
+        last = self._length + len(report.missed)  # the frame that it is now, of each episode
         if isinstance(command, Goals):
+            self._gives_goals = True
             for sim, goals in command.commands.items():
-                self._commands[sim] += [(int(self._length[sim]), goal) for goal in goals]
+                self._commands[sim] += [(int(last[sim]), goal) for goal in goals]
             for sim in command.streamed.tolist():
-                self._streamed[sim].append(int(self._length[sim]))
+                self._streamed[sim] += range(int(self._length[sim]), int(last[sim]) + 1)
         for sim, results in report.results.items():
-            last = int(self._length[sim]) + len(report.missed)
-            self._ends[sim] += [(last, result) for result in results]
+            self._ends[sim] += [(int(last[sim]), result) for result in results]
         self._results = report.results
 
     def _store(self, running: NDArray[np.intp], values: Mapping[str, NDArray]) -> None:
@@ -409,7 +409,7 @@ class EpisodeLoop:
             writer=writer,
             commands=self._commands[sim] if self._gives_goals else None,
             results=self._ends[sim],
-            goal_frames=_spans_without(self._streamed[sim], length),
+            goal_frames=_spans_without(self._streamed[sim], length) if self._streamed[sim] else None,
             plan=plan,
             realtime=None if self.robots.clock is None else self.robots.clock.grants,
             interventions=self._drivers.interventions(sim, length),
@@ -417,9 +417,7 @@ class EpisodeLoop:
 
 
 def _spans_without(frames: Sequence[int], length: int) -> list[tuple[int, int]]:
-    """Return the spans, first and end, of what is left of an episode without some frames; none without any of them."""
-    if not frames:
-        return []
+    """Return the spans, first and end, of what is left of an episode without some frames."""
     ends = [-1, *frames, length]
     return [(first + 1, end) for first, end in itertools.pairwise(ends) if first + 1 < end]
 

@@ -94,7 +94,7 @@ def _goals(episode: Episode) -> dict[str, Any]:
         columns["results"] = _json(
             [[frame, end.task_id, end.success, end.code.name.lower(), end.message] for frame, end in episode.results]
         )
-        if episode.goal_frames:
+        if episode.goal_frames is not None:  # also of an episode that ended before the first goal
             columns["goal_frames"] = _json(episode.goal_frames)
     return columns
 

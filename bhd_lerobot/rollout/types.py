@@ -36,7 +36,7 @@ class Episode:
         commands: the goals that the brain gave, each with the frame in which it gave it; None if it gave setpoints.
         results: how goals ended, each with the frame in which it did.
         goal_frames: spans of the frames, first and end, that followed goals while the brain gave setpoints in the
-            others; empty if it gave none.
+            others; None if it gave none.
         plan: the brain's plan, as plain values, if it has one.
         realtime: what the real-time process was granted and refused; None on the lockstep clock.
         interventions: when an expert or a person drove, in order; None if none could take over.
@@ -52,7 +52,7 @@ class Episode:
     writer: Any
     commands: list[tuple[int, BrainCommand]] | None = None
     results: list[tuple[int, CommandResult]] = field(default_factory=list)
-    goal_frames: list[tuple[int, int]] = field(default_factory=list)
+    goal_frames: list[tuple[int, int]] | None = None
     plan: dict[str, Any] = field(default_factory=dict)
     realtime: list[dict[str, Any]] | None = None
     interventions: list[Intervention] | None = None

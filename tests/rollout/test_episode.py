@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.control.commands import Chunk
+from bhd_lerobot.control.commands import BrainCommand, Chunk, Goals
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.policies.brain import Brain, is_privileged
@@ -102,6 +102,22 @@ def test_a_chunk_does_what_its_actions_sent_one_by_one_do(kind: str, length: int
         assert first.columns.keys() == second.columns.keys()
         for key, column in first.columns.items():
             np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
+
+
+class Once(Script):
+    """Gives an arm a goal in the first frame, and goes on with it."""
+
+    def act(self, observation: Any) -> Any:
+        frame, self.frame = self.frame, self.frame + 1
+        return None if frame else Goals({0: [BrainCommand("there", joint_target=tuple(self.rows[FRAMES, :6]))]})
+
+
+def test_goals_of_a_brain_that_goes_on_with_the_last_are_recorded() -> None:
+    for episode in run("ur5", Once(script("ur5")), n=1):
+        assert episode.commands is not None
+        assert [(frame, goal.task_id) for frame, goal in episode.commands] == [(0, "there")]
+        assert [result.success for _, result in episode.results] == [True]
+        assert episode.goal_frames is None
 
 
 class Breaker(Script):

@@ -133,12 +133,15 @@ def test_an_episode_of_setpoints_and_goals_as_version_0_3_recorded_it_is_repeate
     assert Replay(root, 0).open_loop().identical
 
 
-def test_an_episode_of_setpoints_and_goals_is_repeated(tmp_path):
+@pytest.mark.parametrize("seconds", [2.0, 20.0])
+def test_an_episode_of_setpoints_and_goals_is_repeated(tmp_path, seconds):
+    """Also one that is over before the first goal; it has the metadata of the others."""
     fetch = {"robot__type": "turtlebot3_manipulation", "task__type": "fetch", "brain__type": "fetch"}
-    run_record(tmp_path / "d", **fetch, robot__beams=120, dataset__episode_time_s=20.0, dataset__num_episodes=1)
+    run_record(tmp_path / "d", **fetch, robot__beams=120, dataset__episode_time_s=seconds, dataset__num_episodes=1)
     replay = Replay(tmp_path / "d", 0)
-    spans = json.loads(replay.metadata["goal_frames"])
-    assert 0 < sum(end - first for first, end in spans) < len(replay.columns["action"])
+    followed = sum(end - first for first, end in json.loads(replay.metadata["goal_frames"]))
+    assert (followed > 0) == (seconds > 2)
+    assert followed < len(replay.columns["action"])
     assert replay.open_loop().identical
     assert replay.state_exact().identical
 
