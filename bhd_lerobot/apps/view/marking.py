@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bhd_lerobot.datasets.assembly.assemble import EDITS
+from bhd_lerobot.datasets.assembly.assemble import edit_lines
 from bhd_lerobot.datasets.edit.mark import mark
-from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.errors import ConfigError, DatasetError
 
 _FIELDS = {"outcome": str, "intervention": list, "clear_interventions": bool, "note": str}
 
@@ -40,8 +40,8 @@ def mark_episode(root: Path, index: int, wanted: Any) -> None:
 def marks_of(root: Path, index: int) -> list[dict[str, Any]]:
     """Return what was marked of an episode, oldest first, since episodes have had the numbers that they have now."""
     try:
-        lines = (root / EDITS).read_text(encoding="utf-8").splitlines()
-    except OSError:
+        lines = edit_lines(root)
+    except DatasetError:
         return []
     found: list[dict[str, Any]] = []
     for line in lines:

@@ -94,7 +94,7 @@ def assemble(
     write_meta(new, info, rows, kinds, _stats(plan, known), disk=disk, extra=extra)
     if identity is not None:
         disk.write(new / layout.IDENTITY, to_json(identity))
-    lines = [line for source in sources for line in _edits_of(source)] + [json.dumps(edit, ensure_ascii=False)]
+    lines = [line for source in sources for line in edit_lines(source.root)] + [json.dumps(edit, ensure_ascii=False)]
     disk.write(new / EDITS, "".join(f"{line}\n" for line in lines).encode())
     disk.write(new / layout.INFO, to_json(info))
 
@@ -277,9 +277,10 @@ def _impossible(plan: Plan, place: int, stats: Mapping[str, statistics.Stats]) -
     return {key: to_numpy(frames[key], tuple(features[key]["shape"])) for key in wrong}
 
 
-def _edits_of(source: DatasetState) -> list[str]:
-    path = source.root / EDITS
-    try:
-        return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+def edit_lines(root: Path) -> list[str]:
+    """Return the edits of a dataset, a line of JSON each, oldest first; none if there are none."""
+    path = root / EDITS
+    try:  # Python's lines end at characters, too, that a note may hold as they are
+        return [line for line in path.read_text(encoding="utf-8").split("\n") if line] if path.exists() else []
     except (OSError, ValueError) as error:
         raise corrupt(path, error) from error

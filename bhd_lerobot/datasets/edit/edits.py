@@ -9,11 +9,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, logged_now
+from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, edit_lines, logged_now
 from bhd_lerobot.datasets.assembly.creation import build_root
 from bhd_lerobot.datasets.assembly.picks import Pick
 from bhd_lerobot.datasets.format.identity import FORMAT
-from bhd_lerobot.datasets.format.state import DatasetState, load_state, no_dataset, read_json
+from bhd_lerobot.datasets.format.state import DatasetState, corrupt, load_state, no_dataset, read_json
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
     Workspace,
@@ -318,5 +318,7 @@ def _state_of(root: Path) -> DatasetState:
 
 def edits_of(root: Path | str) -> list[dict[str, Any]]:
     """Return what was done to a dataset after its recording, oldest first."""
-    path = Path(root) / EDITS
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    try:
+        return [json.loads(line) for line in edit_lines(Path(root))]
+    except ValueError as error:
+        raise corrupt(Path(root) / EDITS, error) from error

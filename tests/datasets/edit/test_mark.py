@@ -52,7 +52,7 @@ def test_an_outcome_is_written_to_every_column(tmp_path: Path) -> None:
     root = recorded(tmp_path / "d")
     before, former = content(root), "timeout"
     for outcome in OUTCOMES:
-        mark(root, [1], outcome=outcome, note="ä 'quoted'\nline")
+        mark(root, [1], outcome=outcome, note="ä 'quoted'\nline\u2028\x85")
         after = content(root)
         assert [after[0], after[2]] == [before[0], before[2]]
         metadata = dataset_info(root).episodes[1].metadata
@@ -63,7 +63,7 @@ def test_an_outcome_is_written_to_every_column(tmp_path: Path) -> None:
         assert_valid(root)  # the statistics are those of the new content
         edit = edits_of(root)[-1]
         assert edit["episodes"] == [{"episode": 1, "outcome": [former, outcome]}]
-        assert edit["note"] == "ä 'quoted'\nline"
+        assert edit["note"] == "ä 'quoted'\nline\u2028\x85"
         former = outcome
 
 
