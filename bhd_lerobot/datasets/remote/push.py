@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.assembly.assemble import EDITS
+from bhd_lerobot.datasets.format.identity import differences
+from bhd_lerobot.datasets.format.info import InfoError, parse_object
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.remote.listing import CARD, PREVIEW, RemoteFile, is_recorded, matching, parse_info
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
 from bhd_lerobot.datasets.remote.store import Remote, refuse_overlap
 from bhd_lerobot.datasets.storage import layout
-from bhd_lerobot.errors import DatasetError, DatasetExistsError
+from bhd_lerobot.errors import DatasetError, DatasetExistsError, brief
 
 _SIGNATURE = re.compile(r"\n<!-- bhd-card ([0-9a-f]{64}) -->\n\Z")
 
@@ -121,12 +123,12 @@ def _card(
 
 def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> None:
     """Refuse to overwrite what this dataset is no later version of; a store keeps no history."""
-    name, info = remote.name, there.get(layout.INFO)
-    if info is None or (info.digest is not None and info.matches(local.files[layout.INFO])):
+    name, remedy = remote.name, "or overwrite it with --replace."
+    if layout.INFO not in there:
         return
-    remedy = "or overwrite it with --replace."
+    info, identity, edits = (_other(local, remote, there, path) for path in (layout.INFO, layout.IDENTITY, EDITS))
     try:
-        found = parse_info(remote.read(layout.INFO), name)
+        found = local.state.info if info is None else parse_info(info, name)
     except DatasetError as error:
         raise DatasetExistsError(f"{error} Choose another place, {remedy}") from error
     if _kind(found) != _kind(local.state.info):
@@ -139,6 +141,38 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
             f"{name} has {found['total_episodes']} episodes, {local.root} has {local.state.num_episodes}: it is an "
             f"older one, or another, or some were deleted. Pull that one, or complete that push, {remedy}"
         )
+    if conflicts := _conflicts(identity, local.state.identity):
+        raise DatasetExistsError(
+            f"{name} is another recording than {local.root}: {brief(conflicts, 3)}. Choose another place, {remedy}"
+        )
+    own = local.files[EDITS].read_bytes().splitlines() if EDITS in local.files else []
+    if lost := [line for line in (edits or b"").splitlines() if line not in own]:
+        raise DatasetExistsError(
+            f"{name} was edited or marked, and {local.root} was not: {lost[0].decode(errors='replace'):.120}. Pull "
+            f"that one, {remedy}"
+        )
+
+
+def _other(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile], path: str) -> bytes | None:
+    """Return the content of a file of a remote dataset; None if there is none, or if it is known to be that here."""
+    file = there.get(path)
+    if file is None or (file.digest is not None and path in local.files and file.matches(local.files[path])):
+        return None
+    return remote.read(path)
+
+
+def _conflicts(theirs: bytes | None, ours: Mapping[str, Any] | None) -> list[str]:
+    """Return what two recordings state differently; what only one states, such as one that was merged, is none."""
+    try:
+        there, here = dict(parse_object(theirs or b"{}")["recording"]), dict((ours or {})["recording"])
+    except (InfoError, KeyError, TypeError, ValueError):
+        return []  # one of another program
+    lines = differences("", {**there, "edited": None}, {**here, "edited": None})
+    return [
+        line.replace(": recorded ", ": there ").replace(", requested ", ", here ")
+        for line in lines
+        if ": recorded " in line and ", requested " in line
+    ]
 
 
 def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -8,12 +8,15 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from bhd_lerobot.datasets.edit.edits import merge
+from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
 from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import ConfigError, DatasetExistsError, TransferError
 from tests.datasets import support
+from tests.datasets.foreign import edit_json
 from tests.datasets.remote.store_fixtures import KEYS, stored, use_s3
 from tests.datasets.support import snapshot as content
 
@@ -39,6 +42,30 @@ def test_what_is_no_later_version_replaces_nothing(root: Path, near_url: str, tm
     assert stored(url) == before
     assert push(tmp_path / "small", StoreDataset(url), replace=True).deleted
     assert stored(url) == content(tmp_path / "small")
+
+
+def test_another_recording_and_what_was_marked_there_are_not_overwritten(
+    root: Path, near_url: str, tmp_path: Path
+) -> None:
+    """As many episodes with the same columns do not make it a later version; what only one of both states may."""
+    url, other, marked = near_url, tmp_path / "other", tmp_path / "marked"
+    for copy in (other, marked):
+        shutil.copytree(root, copy)
+    push(root, StoreDataset(url))
+    before = stored(url)
+    edit_json(other / layout.IDENTITY, lambda identity: identity["recording"].update(seed=2))
+    with pytest.raises(DatasetExistsError, match=r"is another recording than .*: seed: there 1, here 2\..*--replace"):
+        push(other, StoreDataset(url))
+    assert stored(url) == before
+    mark(marked, [0], outcome="failure")
+    push(marked, StoreDataset(url))
+    before = stored(url)
+    with pytest.raises(DatasetExistsError, match=r"was edited or marked, and .* was not: .*mark.*--replace"):
+        push(root, StoreDataset(url))
+    assert stored(url) == before
+    push(marked, StoreDataset(url))
+    merge([marked, other], tmp_path / "both")
+    assert push(tmp_path / "both", StoreDataset(url)).episodes == 6
 
 
 class Dying:
