@@ -17,7 +17,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted
 from bhd_lerobot.datasets.storage.layout import Slot
 from bhd_lerobot.datasets.storage.places import check_links
-from bhd_lerobot.datasets.storage.pointers import not_fetched
+from bhd_lerobot.datasets.storage.pointers import not_fetched, pulled_in_part
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, UnsupportedDatasetError, counted, quoted
 
 UNREADABLE = (OSError, pa.ArrowException, ValueError)
@@ -173,6 +173,9 @@ def load_state(root: Path, *, files: bool = True, videos: bool = True, counted: 
             raise corrupt(root / layout.TASKS, f"it has {len(state.tasks)} of {info['total_tasks']} tasks")
         read_rows(state)
         if files:
+            needed = [name for name in state.files() if videos or not name.startswith("videos/")]
+            if (root / layout.SUBSET).is_file() and not all((root / name).is_file() for name in needed):
+                raise pulled_in_part(root)
             _check_files(state, videos, counted)
     return state
 

@@ -14,9 +14,6 @@ from bhd_lerobot.errors import DatasetError
 
 CARD = "README.md"
 PREVIEW = "preview.png"
-SUBSET = "meta/bhd_subset.json"
-"""Names the episodes of a dataset that were requested, if files of it are missing. It is never uploaded."""
-
 _CHUNK_FILE = r"chunk-\d+/file-\d+"
 _RECORDED = re.compile(rf"(data|meta/episodes)/{_CHUNK_FILE}\.parquet|videos/[^/]+/{_CHUNK_FILE}\.mp4")
 

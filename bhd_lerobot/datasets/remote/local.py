@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bhd_lerobot.datasets.format.state import DatasetState, load_state
-from bhd_lerobot.datasets.remote.listing import SUBSET, is_recorded
+from bhd_lerobot.datasets.remote.listing import is_recorded
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import complete_interrupted, has_unfinished_episodes
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.storage.places import check_inside
-from bhd_lerobot.datasets.storage.pointers import check_fetched
+from bhd_lerobot.datasets.storage.pointers import check_fetched, pulled_in_part
 from bhd_lerobot.errors import DatasetError, DatasetLockedError, brief, quoted
 
-_SKIPPED = {SUBSET, layout.UNREPORTED}
+_SKIPPED = {layout.SUBSET, layout.UNREPORTED}
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,8 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
         ) from error
     with contextlib.closing(lock):
         stamps = _stamps(root)
-        if (root / SUBSET).exists():
-            raise DatasetError(
-                f"{root} holds some episodes of a dataset only: it was pulled with --episodes or --outcome. Pull all "
-                "of it first, or make a dataset of its own of these episodes."
-            )
+        if (root / layout.SUBSET).exists():
+            raise pulled_in_part(root)
         check_fetched(root)
         state = load_state(root)
         if not state.num_episodes:

@@ -17,7 +17,6 @@ from pathlib import Path
 from bhd_lerobot.datasets.assembly.assemble import EDITS
 from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.remote.listing import (
-    SUBSET,
     RemoteFile,
     is_recorded,
     matching,
@@ -46,7 +45,7 @@ _SPARE_BYTES = 1 << 20
 _MARKER = ".bhd-pull"
 """In folders beside the target that this program made, and may remove."""
 
-_OURS = {SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY, layout.UNREPORTED}
+_OURS = {layout.SUBSET, EDITS, layout.INFO, layout.STATS, layout.TASKS, layout.IDENTITY, layout.UNREPORTED}
 """Files of a dataset, besides those that `is_recorded` recognises."""
 
 
@@ -116,7 +115,7 @@ class _Pull:
         self._get(wanted)
         is_whole = all(path in wanted for path in there if is_recorded(path))
         note = None if episodes is None or is_whole else to_json({"source": name, "episodes": episodes})
-        before = (self._root / SUBSET).read_bytes() if (self._root / SUBSET).exists() else None
+        before = (self._root / layout.SUBSET).read_bytes() if (self._root / layout.SUBSET).exists() else None
         if not wanted <= self._same or note != before:
             self._publish(wanted, note)
         return PullReport(
@@ -209,7 +208,7 @@ class _Pull:
                 (space.folder / path).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(self._folder / path, space.folder / path)
             if note is not None:
-                (space.folder / SUBSET).write_bytes(note)
+                (space.folder / layout.SUBSET).write_bytes(note)
             names = {path.name for path in space.folder.iterdir()}
             for former in (file for name in names for file in (root / name).rglob("*")):
                 inside = former.relative_to(root).as_posix()
@@ -273,13 +272,13 @@ def _files(remote: Remote) -> dict[str, RemoteFile]:
     for path in there:
         if wrong := wrong_path(path):
             raise TransferError(f"{name} has a file that cannot be fetched: {wrong}.")
-    return {path: file for path, file in there.items() if path[0] != "." and path != SUBSET}
+    return {path: file for path, file in there.items() if path[0] != "." and path != layout.SUBSET}
 
 
 def _episodes_before(root: Path) -> list[int]:
     """Return the episodes that were requested before; none without a note, or if it cannot be read."""
     try:
-        return [int(one) for one in json.loads((root / SUBSET).read_bytes())["episodes"]]
+        return [int(one) for one in json.loads((root / layout.SUBSET).read_bytes())["episodes"]]
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return []
 

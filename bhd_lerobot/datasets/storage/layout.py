@@ -13,6 +13,9 @@ IDENTITY = "meta/bhd.json"
 UNREPORTED = "meta/bhd_unreported.json"
 """The last edit, until its report has been printed."""
 
+SUBSET = "meta/bhd_subset.json"
+"""The episodes of a dataset that were pulled, if files of others are missing. It is never uploaded."""
+
 STAGING = ".bhd"
 """Folder inside the root that holds everything unfinished. It is absent from a finalised dataset."""
 

@@ -1,4 +1,4 @@
-"""Files that were not fetched: in their place Git keeps a pointer, a few lines of text. They are whole elsewhere."""
+"""Files that were not fetched, and are whole elsewhere: Git keeps a pointer in their place, a few lines of text."""
 
 import contextlib
 from collections.abc import Iterable
@@ -11,7 +11,7 @@ _LONGEST = 1024  # bytes of a pointer
 
 
 class NotFetchedError(DatasetError):
-    """Files of a dataset are pointers. That is no damage: nothing is to be recovered."""
+    """Files of a dataset were not fetched. That is no damage: nothing is to be recovered."""
 
 
 def fetching(path: Path) -> str:
@@ -34,6 +34,14 @@ def not_fetched(root: Path, paths: Iterable[Path]) -> NotFetchedError | None:
     return NotFetchedError(
         f"{brief(names, 3)} in {root} {what} of Git, in the place of a file that was not fetched. Run "
         f"`{' and '.join(sorted(set(commands.values())))}` in that folder. Nothing was changed."
+    )
+
+
+def pulled_in_part(root: Path) -> NotFetchedError:
+    """Return the error for a dataset of which only the files of some episodes were pulled."""
+    return NotFetchedError(
+        f"{root} holds some episodes of a dataset only: it was pulled with --episodes, --outcome or --min_score. `bhd-data "
+        "pull` without them fetches the rest. Nothing was changed."
     )
 
 
