@@ -230,13 +230,12 @@ def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str
         index = places[pick.row["episode_index"]]
         own = {key: {name: values[index] for name, values in stat.items()} for key, stat in stored.items()}
         row = plan.rows[place]
-        columns: dict[str, np.ndarray] = {
+        columns: dict[str, np.ndarray] = _impossible(plan, place, own) | {
             "episode_index": np.full(row["length"], place),
             "index": np.arange(row["dataset_from_index"], row["dataset_to_index"]),
             "task_index": plan.task_indexes(place),
             **pick.columns,
         }
-        columns |= _impossible(plan, place, own)
         fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:

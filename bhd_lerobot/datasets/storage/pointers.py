@@ -40,8 +40,8 @@ def not_fetched(root: Path, paths: Iterable[Path]) -> NotFetchedError | None:
 def pulled_in_part(root: Path) -> NotFetchedError:
     """Return the error for a dataset of which only the files of some episodes were pulled."""
     return NotFetchedError(
-        f"{root} holds some episodes of a dataset only: it was pulled with --episodes, --outcome or --min_score. `bhd-data "
-        "pull` without them fetches the rest. Nothing was changed."
+        f"{root} holds some episodes of a dataset only: it was pulled with --episodes, --outcome or --min_score. "
+        "`bhd-data pull` without them fetches the rest. Nothing was changed."
     )
 
 

@@ -248,6 +248,26 @@ def test_columns_and_files_of_other_programs_are_kept(plain: Path, tmp_path: Pat
     assert operators(root) == [f"person {index}" for index in range(6)]
 
 
+def test_deviations_that_cannot_be_those_of_the_data_are_computed_from_the_new_content(
+    plain: Path, tmp_path: Path
+) -> None:
+    """Another program rounds them to nothing; also those of columns that an edit writes anew."""
+    for name, edit in (
+        ("deleted", lambda root: delete(root, [0])),
+        ("marked", lambda root: mark(root, [1], outcome="failure")),
+    ):
+        root = Path(shutil.copytree(plain, tmp_path / name))
+        (path,) = (root / "meta/episodes").rglob("*.parquet")
+        table = pq.read_table(path)
+        for key in ("index", "event", "observation.state"):
+            place, width = table.schema.get_field_index(f"stats/{key}/std"), 3 if key == "observation.state" else 1
+            zeros = pa.array([[0.0] * width] * len(table), table.schema.types[place])
+            table = table.set_column(place, table.schema.field(place), zeros)
+        pq.write_table(table, path)
+        edit(root)
+        assert not [finding for finding in check_dataset(root).findings if finding.check == "stats"], name
+
+
 def test_datasets_share_no_file(plain: Path, video_dataset: Path, tmp_path: Path) -> None:
     """Other programs write into files; what happens to one dataset must not happen to another."""
     for number, source in enumerate((plain, video_dataset)):

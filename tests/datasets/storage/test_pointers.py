@@ -1,4 +1,4 @@
-"""A file that was not fetched, by Git or by a pull of some episodes, is no damage; it is to be fetched, not recovered."""
+"""A file that Git, or a pull of some episodes, did not fetch is no damage; it is to be fetched, not recovered."""
 
 import shutil
 from collections.abc import Callable
