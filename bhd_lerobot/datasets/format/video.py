@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.storage.pointers import not_fetched
@@ -232,14 +233,20 @@ class EncodedVideo:
 
 def count_frames(path: Path) -> int:
     """Return how many frames a video file holds, by reading all of it but decoding nothing."""
+    return len(frame_times(path))
+
+
+def frame_times(path: Path) -> NDArray[np.float64]:
+    """Return when each frame of a video file is shown [s], ascending; decodes nothing."""
     import av
 
     try:
         with av.open(str(path)) as container:
-            frames = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+            stream = container.streams.video[0]
+            shown = [packet.pts for packet in container.demux(stream) if packet.size > 0]
+            return np.sort(np.array([np.nan if pts is None else pts for pts in shown]) * float(stream.time_base or 1))
     except (av.error.FFmpegError, IndexError) as error:
         raise OSError(getattr(error, "errno", None), str(error), str(path)) from error
-    return frames
 
 
 def stream_signature(path: Path) -> tuple[Any, ...]:

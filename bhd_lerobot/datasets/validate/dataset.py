@@ -101,10 +101,19 @@ def _check_videos(files: Files, findings: Findings) -> None:
                 continue  # reported already
             lengths = np.array([row["length"] for row in rows])
             try:
-                found = video.count_frames(path)
+                times = video.frame_times(path)
             except OSError as error:
                 findings.error("video", name, f"it cannot be read: {error}", RESTORE)
                 continue
+            found = len(times)
+            frames = np.arange(found) / fps
+            if (off := np.flatnonzero(np.abs(times - times[:1] - frames) > 0.5 / fps)).size:
+                what = (
+                    f"its frames are not {1 / fps:.4g} s apart: frame {off[0]} is shown "
+                    f"{times[off[0]] - times[0]:.3f} s after the first, and due after {frames[off[0]]:.3f} s, where "
+                    "loaders look for it"
+                )
+                findings.error("video", name, what, f"Encode it again with {fps:g} frames a second.")
             if found != lengths.sum():
                 what = f"it has {found} frames; its episodes have {lengths.sum()}"
                 if found > lengths.sum():
@@ -112,8 +121,8 @@ def _check_videos(files: Files, findings: Findings) -> None:
                 findings.error("video", name, what, RESTORE)
             begin, end = (np.array([row[f"videos/{key}/{at}_timestamp"] for row in rows]) for at in ("from", "to"))
             expected = (np.cumsum(lengths) - lengths) / fps
-            off = (np.abs(begin - expected) > 0.5 / fps) | (np.abs(end - begin - lengths / fps) > 0.5 / fps)
-            for position in np.flatnonzero(off)[:3]:
+            misplaced = (np.abs(begin - expected) > 0.5 / fps) | (np.abs(end - begin - lengths / fps) > 0.5 / fps)
+            for position in np.flatnonzero(misplaced)[:3]:
                 what = (
                     f"episode {rows[position]['episode_index']} has the place from "
                     f"{begin[position]:.3f} to {end[position]:.3f} s, and its {lengths[position]} frames begin at "

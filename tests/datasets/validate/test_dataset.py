@@ -12,6 +12,7 @@ from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, spli
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from bhd_lerobot.cli.data import main
+from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Finding, Severity, check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from tests.cases import each_case
@@ -315,7 +316,7 @@ def test_damaged_files_are_found(valid: Path, tmp_path: Path) -> None:
         assert found.worst == Severity.ERROR
 
 
-def test_a_video_that_is_too_short_is_found(video_dataset: Path, tmp_path: Path) -> None:
+def test_a_video_that_is_too_short_or_too_fast_is_found(video_dataset: Path, tmp_path: Path) -> None:
     root = copy(video_dataset, tmp_path)
     video, other = next((root / "videos").rglob("*.mp4")), tmp_path / "other"
     record(other, video=True, finalize=False)
@@ -325,6 +326,16 @@ def test_a_video_that_is_too_short_is_found(video_dataset: Path, tmp_path: Path)
     (one,) = bad(check_dataset(root))
     assert (one.check, one.what) == ("video", "it has 20 frames; its episodes have 135")
     assert bad(check_dataset(root, videos=False)) == []
+    encoder = CameraEncoder(tmp_path / "fast.mp4", FPS + 2, (32, 48), VideoSettings())
+    for _ in range(135):
+        encoder.add(np.zeros((32, 48, 3), np.uint8))
+    encoder.finish()
+    shutil.copy(tmp_path / "fast.mp4", video)  # as many frames, of which no loader finds most
+    (one,) = bad(check_dataset(root))
+    assert (one.check, one.severity) == ("video", Severity.ERROR)
+    assert one.what.startswith(
+        "its frames are not 0.1 s apart: frame 4 is shown 0.333 s after the first, and due after 0.4"
+    )
     video.write_bytes(b"no video")
     (one,) = bad(check_dataset(root))
     assert (one.check, one.severity) == ("video", Severity.ERROR)
