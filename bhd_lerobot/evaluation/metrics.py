@@ -56,12 +56,21 @@ class JerkMeasure:
         joints = [column for name, column in index.items() if name.endswith(".pos") and name != "gripper.pos"]
         return cls(tuple(joints), 3, "rad/s³", "joint positions")
 
-    def lengths(self, applied: NDArray, fps: int) -> NDArray[np.float64]:
-        """Return the jerk between frames, shape (frames - order,), of applied commands, shape (frames, actions)."""
+    def lengths(self, applied: NDArray, places: NDArray[np.float64], fps: int) -> NDArray[np.float64]:
+        """Return the jerk between frames, shape (frames - order,).
+
+        Args:
+            applied: the commands, shape (frames, actions).
+            places: of the frames on the grid of time, shape (frames,).
+            fps: places in a second [Hz].
+        """
         values = applied[:, self.columns].astype(np.float64)
         if len(values) <= self.order or not self.columns:
             return np.zeros(0)
-        return np.linalg.norm(np.diff(values, self.order, axis=0), axis=1) * float(fps) ** self.order
+        for _ in range(self.order):
+            values = np.diff(values, axis=0) / np.diff(places)[:, None]
+            places = (places[1:] + places[:-1]) / 2
+        return np.linalg.norm(values, axis=1) * float(fps) ** self.order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +155,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
     `track`: where base or tool was at the start of each frame, x, y, z first [m], shape (frames, 3 or more), or empty.
     """
     columns, outcome = episode.columns, episode.outcome
-    lengths = jerk.lengths(columns[keys.APPLIED_ACTION], fps)
+    lengths = jerk.lengths(columns[keys.APPLIED_ACTION], _places(episode, fps), fps)
     modes = columns[keys.MODE]
     return EpisodeMetrics(
         brain=brain,
@@ -157,7 +166,7 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         score=float(outcome.score),
         reward=float(columns[keys.REWARD].sum(dtype=np.float64)),
         frames=episode.frames,
-        length_s=episode.frames / fps,
+        length_s=episode.duration_s(fps),
         path_m=float(np.linalg.norm(np.diff(track[:, :3], axis=0), axis=1).sum()) if len(track) else math.nan,
         jerk_mean=float(lengths.mean()) if len(lengths) else math.nan,
         jerk_max=float(lengths.max()) if len(lengths) else math.nan,
@@ -172,6 +181,15 @@ def measure(brain: str, episode: Episode, track: NDArray[np.float64], jerk: Jerk
         perception=assess(episode.plan, episode.scene),
         wall=_wall(episode),
     )
+
+
+def _places(episode: Episode, fps: int) -> NDArray[np.float64]:
+    """Return the places of the frames on the grid of time, of which a robot that is too slow leaves some out."""
+    places = np.arange(episode.frames, dtype=np.float64)
+    if episode.timing.clock == "lockstep":
+        return places
+    time_s = episode.columns[keys.TIME]
+    return np.maximum.accumulate(np.round((time_s - time_s[0]) * fps) - places) + places
 
 
 def _wall(episode: Episode) -> dict[str, float]:

@@ -171,6 +171,6 @@ class PassiveRecording:
             brain |= {"goal": result.task_id, "result": result.code.name.lower(), "message": result.message}
         metadata = episode_metadata(episode, split="train", task=self._make_task().parameters(), brain=brain)
         save_episode(self._recorder, episode, metadata)
-        duration_s = episode.frames / self._recorder.fps
+        duration_s = episode.duration_s(self._recorder.fps)
         name = "" if result is None else f", goal {result.task_id}"
         self._report(f"Episode {episode.spec.index} is saved: {episode.outcome.event.cause}, {duration_s:.1f} s{name}.")

@@ -94,11 +94,9 @@ class RecordResult:
             self.problems[episode.plan["problem"]] += 1
         self.frames += episode.frames
         self.late += int(np.count_nonzero(episode.columns[LATE]))
-        time_s = episode.columns[TIME]
-        is_live = episode.timing.clock == "realtime"
-        self.simulated_s += time_s[-1] - time_s[0] + 1 / fps if is_live else episode.frames / fps
-        if is_live:
-            kept = _kept_fps(time_s, fps)
+        self.simulated_s += episode.duration_s(fps)
+        if episode.timing.clock == "realtime":
+            kept = _kept_fps(episode.columns[TIME], fps)
             if kept < (1 - _LEFT_OUT) * fps:
                 self.kept_fps = min(kept, self.kept_fps or kept)
 

@@ -61,3 +61,10 @@ class Episode:
     def frames(self) -> int:
         """Number of frames."""
         return len(self.columns[keys.ACTION])
+
+    def duration_s(self, fps: int) -> float:
+        """Return how long it lasted [s]; on the wall clock as measured: a robot that is too slow leaves frames out."""
+        if self.timing.clock == "lockstep":
+            return self.frames / fps
+        time_s = self.columns[keys.TIME]
+        return float(time_s[-1] - time_s[0]) + 1 / fps

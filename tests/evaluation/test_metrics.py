@@ -1,6 +1,7 @@
 """The numbers of an episode: jerk of known motions, paths of known length, flags counted by kind, digests."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,20 @@ def test_jerk_of_joints_is_the_length_of_the_third_derivative_without_the_grippe
     applied = np.stack([0.3 * cubic, 0.4 * cubic, *[0 * t] * 4, 5 * cubic], axis=1)
     metrics = measured(episode(applied), names=ur5().limits.names)
     assert metrics.jerk_mean == pytest.approx(0.5, rel=1e-2)
+
+
+@pytest.mark.parametrize("kept", [[0, 1, 2, 5, 6, 7, 8, 9], list(range(0, 30, 2)), list(range(30))], ids=len)
+def test_a_robot_that_leaves_frames_out_on_the_wall_clock_has_the_jerk_and_the_duration_of_its_motion(kept) -> None:
+    t = np.array(kept) / FPS
+    given = episode(np.stack([0.5 * 0.04 * t**2, np.sin(40 * t)], axis=1))
+    jitter = 0.01 * np.cos(np.arange(len(t)))
+    live = replace(
+        given, timing=replace(given.timing, clock="realtime"), columns={**given.columns, keys.TIME: t + jitter}
+    )
+    metrics = measured(live)
+    assert metrics.jerk_mean == pytest.approx(0.04, rel=1e-2)
+    assert metrics.jerk_max == pytest.approx(0.04, rel=3e-2)
+    assert metrics.length_s == pytest.approx((kept[-1] + 1) / FPS, abs=0.03)
 
 
 def test_a_robot_at_rest_and_one_at_constant_speed_have_no_jerk_and_a_short_episode_has_none_defined():
