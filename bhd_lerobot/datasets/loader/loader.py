@@ -239,4 +239,4 @@ def imagenet_stats(meta: Any) -> None:
     for key in meta.camera_keys if meta.stats else ():
         if key not in meta.depth_keys:
             for name, values in IMAGENET_STATS.items():
-                meta.stats[key][name] = torch.tensor(values, dtype=torch.float32)
+                meta.stats.setdefault(key, {})[name] = torch.tensor(values, dtype=torch.float32)

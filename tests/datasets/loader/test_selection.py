@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,9 +24,11 @@ from bhd_lerobot.datasets.loader.loader import (
     split_episodes,
 )
 from bhd_lerobot.datasets.loader.table import open_metadata
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetError
 from tests.cases import each_case
+from tests.datasets.foreign import edit_json
 from tests.datasets.loader import support
 from tests.datasets.loader.support import FRONT, WRIST
 
@@ -148,6 +151,13 @@ def test_an_intervention_that_lasts_to_the_end_counts_to_the_end(
     weights = frame_weights(open_metadata(tmp_path / "d"), None, intervention=intervention, learner=learner)
     assert weights is not None
     assert weights.tolist() == [*[learner] * 2, *[intervention] * 3, *[learner] * 5, *[1.0] * 5]
+
+
+def test_images_without_statistics_are_normalised_by_those_of_imagenet(video_dataset: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(video_dataset, tmp_path / "d"))
+    edit_json(root / layout.STATS, lambda stats: stats.pop(FRONT))
+    meta = make_loader("t/t", LoaderConfig(batch_size=2), root=root).dataset.meta
+    assert meta.stats[FRONT]["mean"].flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
 
 
 KEYS = ["observation.state", "action"]
