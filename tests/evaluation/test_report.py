@@ -1,6 +1,7 @@
 """The report: it is one file that needs no other, it says what the results say, and its charts are there."""
 
 import base64
+import errno
 import hashlib
 import json
 import math
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.datasets.storage import disk
 from bhd_lerobot.evaluation import plots, run
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.plots import OUTCOMES, notable_episodes
@@ -213,6 +215,22 @@ def test_episodes_that_begin_alike_are_counted_and_said_to_be_no_independent_one
 def test_infinity_and_nan_become_null_in_json(tmp_path):
     write_json(tmp_path / "x.json", {"a": math.nan, "b": [math.inf, 1.5], "c": {"d": -math.inf}})
     assert json.loads((tmp_path / "x.json").read_text()) == {"a": None, "b": [None, 1.5], "c": {"d": None}}
+
+
+@pytest.mark.parametrize("action", ["open", "write", "rename"])
+def test_results_are_written_completely_or_stay_what_they_were(tmp_path, monkeypatch, action):
+    """A run that is killed meanwhile, or on a full disk, can be continued by what was written before."""
+    path = tmp_path / "results.json"
+    write_json(path, {"partial": True})
+
+    def fail(step, _):
+        if step == action:
+            raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(disk, "_before_step", fail)
+    with pytest.raises(OSError, match="full"):
+        write_json(path, {"partial": False})
+    assert json.loads(path.read_text()) == {"partial": True}
 
 
 def test_charts_are_the_same_bytes_twice():
