@@ -19,9 +19,10 @@ from bhd_lerobot.datasets.format.features import (
     SUBTASK,
 )
 from bhd_lerobot.datasets.format.identity import default_root
+from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import ConfigError, RealtimeError, RenderingError, counted
+from bhd_lerobot.errors import ConfigError, DatasetMismatchError, RealtimeError, RenderingError, counted
 from bhd_lerobot.hub.push import check_pushable, format_push_report, left_by_interrupt, push_command, push_dataset
 from bhd_lerobot.hub.transfer import prompt_interrupt
 from bhd_lerobot.policies.teleop.config import TeleopConfig
@@ -102,7 +103,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
                 # A view that cannot be started fails before a dataset exists.
                 loop.observer = opened.enter_context(live_view(config, robots, console))
                 made = open_recorder(_recording(config, root), robots, task, brain)
-                recorder = opened.enter_context(closing_used(made, is_new=is_new))
+                recorder = _continuable(opened.enter_context(closing_used(made, is_new=is_new)))
             result = RecordResult(root, output_dir, attempts=brain.attempts, stopped_by=stop)
             if recorder.repair_report:
                 console.print(f"Repaired before resuming: {recorder.repair_report}")
@@ -331,6 +332,18 @@ def _recording(config: RecordConfig, root: Path) -> Recording:
         language=dataset.language,
         expert_action=dataset.expert_action,
     )
+
+
+def _continuable(recorder: DatasetRecorder) -> DatasetRecorder:
+    """Return a recorder if the episodes of its dataset are those of their numbers: the missing ones follow them."""
+    for episode in dataset_info(recorder.root).episodes if recorder.num_episodes else ():
+        if (number := episode.metadata.get("episode")) != episode.index:
+            what = "of another program" if number is None else f"number {number} of its recording"
+            raise DatasetMismatchError(
+                f"{recorder.root} cannot be resumed: its episode {episode.index} is {what}, so the next episodes would "
+                "not be the missing ones. Record those into another root, with another seed, and merge the two."
+            )
+    return recorder
 
 
 def _judged_task(config: RecordConfig, robots: Robots, console: Console) -> Task:

@@ -4,11 +4,13 @@ import io
 import json
 import os
 import random
+import shutil
 import signal
 import time
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
@@ -24,7 +26,7 @@ from bhd_lerobot.options.parse import encode, parse
 from bhd_lerobot.recording import record as record_module
 from bhd_lerobot.recording.config import RecordConfig
 from tests.cases import each_case
-from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, start
+from tests.recording.support import data_columns, episode_rows, options, run_record, save_lidar_policy, saved, start
 
 ARM = {"robot__type": "ur5", "brain__type": "language", "task__type": "pick", "robot__beams": None}
 
@@ -135,6 +137,20 @@ def test_resume_refuses_another_recording_and_shows_the_difference(recorded):
     ):
         with pytest.raises(DatasetMismatchError, match=shown):
             run_record(recorded[0], resume="true", dataset__num_episodes=5, **change)
+
+
+@pytest.mark.parametrize(("number", "shown"), [(7, "number 7 of its recording"), (None, "of another program")])
+def test_resume_refuses_episodes_that_are_not_those_of_their_numbers(recorded, tmp_path, number, shown):
+    """As of `bhd-eval` with `episodes`, or of LeRobot that went on: the next would not be the missing ones."""
+    root = Path(shutil.copytree(recorded[0], tmp_path / "d"))
+    (path,) = (root / "meta/episodes").rglob("*.parquet")
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("bhd/episode")
+    numbers = pa.array([*table["bhd/episode"].to_pylist()[:-1], number], pa.int64())
+    pq.write_table(table.set_column(place, table.schema.field(place), numbers), path)
+    with pytest.raises(DatasetMismatchError, match=f"cannot be resumed: its episode 2 is {shown}"):
+        run_record(root, resume="true", dataset__num_episodes=5)
+    assert saved(root) == 3
 
 
 def test_killed_and_resumed_is_the_same_as_undisturbed(tmp_path):
