@@ -345,12 +345,17 @@ def make_robot(
         n: how many.
         threads: threads that step the physics; all processors if None.
         fps: frames a second [Hz], of a robot of another package.
-        gate: what is let through to one, likewise.
+        gate: what is let through to one; of ours there is none.
     """
     if not is_ours(config.type):
         from bhd_lerobot.robots.external.make import make_external
 
         return make_external(config, fps, gate or GateConfig())
+    if gate is not None and gate != GateConfig():
+        raise ConfigError(
+            f"gate is of robots of other packages, and robot.type is {config.type!r}, whose cerebellum keeps its "
+            "body's limits. Leave gate out."
+        )
     if config.clock != "realtime":
         return make_simulation(config, n, threads)
     if n != 1:

@@ -15,7 +15,7 @@ def _replay(config: ReplayConfig) -> int:
         replay_on_robot(root_of(config), config.dataset.episode, config.robot, config.gate, Console(stderr=True))
         return 0
     worst = max(float(result.position_m.max()) for result in replay(config))
-    return int(config.tolerance_m is not None and worst > config.tolerance_m)
+    return int(config.tolerance_m is not None and not worst <= config.tolerance_m)  # what is not a number is not
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -65,6 +65,14 @@ class ReplayConfig(Options):
     robot: RobotConfig | None = None
     gate: GateConfig = field(default_factory=GateConfig)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.robot is not None and self.tolerance_m is not None:
+            raise ConfigError(
+                "tolerance_m and robot are both given, and not all that a robot observes is in metres. Leave one of "
+                "them out; the differences are printed in any case."
+            )
+
 
 @dataclass(frozen=True)
 class Divergence:

@@ -13,6 +13,8 @@ from bhd_lerobot.rollout.replay import Replay
 from tests.cases import each_case
 from tests.recording.support import run_record
 
+ROBOT = ("--robot.type=turtlebot3", "--robot.clock=realtime")
+
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
@@ -93,6 +95,8 @@ def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path
     [
         (["--dataset.root={}", "--mode=openloop"], "Did you mean 'open_loop'"),
         (["--dataset.root={}", "--tolerance_m=-1"], "tolerance_m is -1"),
+        (["--dataset.root={}", *ROBOT, "--tolerance_m=1"], "tolerance_m and robot are both given"),
+        (["--dataset.root={}", *ROBOT, "--gate.max_change=5"], "gate is of robots of other packages"),
         (["--dataset.root={}", "--dataset.episode=9"], "from 0 to 2"),
         ([], "No dataset is given; set --dataset.root=FOLDER"),
     ],

@@ -14,7 +14,7 @@ FPS = 30
 
 @dataclass
 class GateConfig(Options, prefix="gate."):
-    """What is let through to a robot that is not ours; without effect on ours, which have a cerebellum.
+    """What is let through to a robot that is not ours; ours have a cerebellum, and refuse it.
 
     Attributes:
         range: lowest and highest value of an action by its name, `--gate.range.x.vel='[-0.2, 0.2]'`; where there is
