@@ -145,6 +145,7 @@ class Replay:
                 self._by_goals[first:end] = True
         self._initial = np.asarray(metadata["initial_state"], np.float64)
         self.is_live = summary.recording["robot"].get("clock") == "realtime"
+        self.differing: list[str] = summary.recording.get("differing", [])
 
     def changed_versions(self) -> dict[str, tuple[str, str]]:
         """Return what has another version than at the recording: name to recorded and present version."""
@@ -241,6 +242,11 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
         raise ConfigError(f"The folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error
     for name, (then, now) in episode.changed_versions().items():
         console.print(f"Recorded with {name} {then}, replayed with {now}: differences may come from that.")
+    if episode.differing:
+        console.print(
+            f"Merged of recordings with different {', '.join(episode.differing)}: of these it is replayed with the "
+            "defaults, and differences may come from that. The datasets that it was merged of know them."
+        )
     if episode.is_live:
         console.print(
             "Recorded on the wall clock: commands took effect when they came, not at the start of a frame. open_loop "

@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from bhd_lerobot.cli.replay import main
+from bhd_lerobot.datasets.edit.edits import delete, merge
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
 from bhd_lerobot.rollout.replay import Replay
@@ -104,6 +105,21 @@ def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path
 def test_what_cannot_be_replayed_is_named(recorded, capsys, options, message):
     assert main([option.format(recorded) for option in options]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_options_in_which_merged_recordings_differ_are_named(tmp_path, capsys):
+    """Of these no episode says any more what it had; also after further merges and edits."""
+    for name, seed, more in (("a", 1, {}), ("b", 2, {"robot__physics_hz": 400}), ("c", 3, {"robot__physics_hz": 400})):
+        run_record(tmp_path / name, seed=seed, dataset__num_episodes=1, dataset__episode_time_s=1, **more)
+    merge([tmp_path / "b", tmp_path / "c"], tmp_path / "same")
+    merge([tmp_path / "same", tmp_path / "a"], tmp_path / "both")
+    merge([tmp_path / "both", tmp_path / "a"], tmp_path / "all")
+    delete(tmp_path / "all", [0])
+    for name, is_named in (("same", False), ("both", True), ("all", True)):
+        main([f"--dataset.root={tmp_path / name}", f"--output_dir={tmp_path}", "--mode=open_loop"])
+        text = " ".join(capsys.readouterr().err.split())
+        assert ("Merged of recordings with different robot.physics_hz" in text) == is_named, name
+        assert is_named or "identical" in text
 
 
 def test_a_dataset_of_another_program_is_refused_with_a_remedy(recorded, tmp_path):

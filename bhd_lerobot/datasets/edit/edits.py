@@ -12,7 +12,7 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, edit_lines, logged_now
 from bhd_lerobot.datasets.assembly.creation import build_root
 from bhd_lerobot.datasets.assembly.picks import Pick
-from bhd_lerobot.datasets.format.identity import FORMAT
+from bhd_lerobot.datasets.format.identity import FORMAT, differences
 from bhd_lerobot.datasets.format.state import DatasetState, corrupt, load_state, no_dataset, read_json
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
@@ -70,7 +70,8 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
         sizes = [{"root": state.root.name, "episodes": len(state.rows)} for state in states]
         recordings = [(state.identity or {}).get("recording", {}) for state in states]
         _check_units(paths, recordings)
-        return _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, _common(recordings))
+        recording = _common(recordings) | ({"differing": names} if (names := _differing(recordings)) else {})
+        return _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, recording)
 
 
 def _check_units(paths: Sequence[Path], recordings: Sequence[Mapping[str, Any]]) -> None:
@@ -279,6 +280,14 @@ def _common(recordings: Sequence[Mapping[str, Any]], *, of_one_type: bool = Fals
             if of_one_type or "type" in options:
                 shared[name] = options
     return shared
+
+
+def _differing(recordings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the options of the robot that recordings, or those that they were merged of, state differently."""
+    first, *others = [recording.get("robot", {}) for recording in recordings]
+    lines = [line for other in others for line in differences("robot", first, other)]
+    names = {line.partition(": ")[0] for line in lines if ": recorded " in line and ", requested " in line}
+    return sorted(names.union(*(recording.get("differing", ()) for recording in recordings)))
 
 
 def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
