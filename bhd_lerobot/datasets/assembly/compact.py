@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from bhd_lerobot.datasets.assembly.files import build_data, build_videos, data_groups, video_groups
 from bhd_lerobot.datasets.assembly.picks import Files, Pick, Plan
@@ -59,6 +60,7 @@ def _build_meta(
     limit = state.info["data_files_size_in_mb"] * MEBIBYTE
     # Full files whose rows did not change are kept; everything after the first other one is written again.
     done, slot = 0, None
+    columns = {f"stats/{key}/{name}" for key, stat in stats.items() for name in stat}
     for source, old_rows in ordered_slots(state.rows, "meta/episodes").items():
         path = state.root / layout.episodes_file(source)
         following = layout.next_slot(slot, state.info["chunks_size"])
@@ -66,6 +68,8 @@ def _build_meta(
             break
         if state.without_stats.intersection(row["episode_index"] for row in old_rows):
             break
+        if {name for name in pq.read_schema(path).names if name.startswith("stats/")} != columns:
+            break  # LeRobot loads only files that have the same
         disk.make_folder((new / layout.episodes_file(source)).parent)
         disk.link(path, new / layout.episodes_file(source))
         done, slot = done + len(old_rows), source
@@ -102,7 +106,12 @@ def episode_stats(
                         what = f"its statistic {name} of {key!r} has another shape than the feature"
                         raise corrupt(state.root / layout.episodes_file(slot), what)
                     result[key][name][[order[i] for i in places]] = values[places]
-        unknown += [row for row in rows if row["episode_index"] in state.without_stats]
+        # Another program may store fewer of them: those of columns are computed, those of images are left out.
+        names = statistics.STATISTICS
+        lacks = any(name not in stored.get(key, {}) for key in schema.float_keys for name in names)
+        unknown += [row for row in rows if lacks or row["episode_index"] in state.without_stats]
+        for key in schema.videos:
+            result[key] = {name: values for name, values in result[key].items() if name in stored.get(key, {})}
     files = ordered_slots(state.rows, "data") if unknown else {}
     for slot, rows in ordered_slots(unknown, "data").items():
         path = state.root / layout.data_file(slot)
@@ -110,7 +119,7 @@ def episode_stats(
         for row in rows:
             stats = _stats_from_data(schema, frames[row["episode_index"]], path)
             _store(result, row["episode_index"], stats)
-    return result
+    return {key: stat for key, stat in result.items() if stat}
 
 
 def _stats_from_data(schema: Schema, frames: pa.Table, path: Path) -> EpisodeStats:
@@ -124,5 +133,5 @@ def _stats_from_data(schema: Schema, frames: pa.Table, path: Path) -> EpisodeSta
 
 def _store(result: dict[str, statistics.Stats], episode: int, stats: EpisodeStats) -> None:
     for key, stat in stats.items():
-        for name, values in stat.items():
-            result[key][name][episode] = values
+        for name in stat.keys() & result[key].keys():
+            result[key][name][episode] = stat[name]

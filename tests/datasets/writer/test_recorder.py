@@ -254,6 +254,32 @@ def test_resuming_appends_and_touches_full_files_no_more(tmp_path: Path, monkeyp
     assert support.verify(root, 14, video=True, stats=True) == 14
 
 
+@pytest.mark.parametrize("lacking", ["/q", f"stats/{support.CAMERA}"])
+def test_statistics_that_another_program_did_not_store_are_computed_or_left_out(tmp_path: Path, lacking: str) -> None:
+    """Older versions of LeRobot know no quantiles; those of images only decoding would tell."""
+    for name in ("whole", "lacking"):
+        root = tmp_path / name
+        with support.create(root, video=True) as recorder:
+            for _ in range(3):
+                support.record(recorder, video=True)
+        if name == "lacking":
+            (path,) = (root / "meta/episodes").rglob("*.parquet")
+            table = pq.read_table(path)
+            gone = [column for column in table.column_names if column.startswith("stats/") and lacking in column]
+            assert gone
+            pq.write_table(table.drop_columns(gone), path)
+        with support.resume(root, video=True) as recorder:
+            support.record(recorder, video=True)
+    whole, other = (json.loads((tmp_path / name / "meta/stats.json").read_text()) for name in ("whole", "lacking"))
+    for key, stat in whole.items():
+        if key != support.CAMERA:
+            assert other[key] == stat, key
+        elif lacking == "/q":
+            assert other[key] == {name: values for name, values in stat.items() if not name.startswith("q")}
+        else:
+            assert key not in other
+
+
 def test_stock_lerobot_can_append_and_we_can_go_on(tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
