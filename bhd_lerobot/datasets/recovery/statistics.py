@@ -54,7 +54,12 @@ def stats_of(
                 stacked.setdefault(key, {}).setdefault(name, []).append(
                     np.asarray(values, None if name == "count" else np.float64)
                 )
-    return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
+    # What only some episodes have, such as depth of those whose rows are left, is of no use for all.
+    whole = {
+        key: {name: np.stack(values) for name, values in stat.items() if len(values) == len(rows)}
+        for key, stat in stacked.items()
+    }
+    return {key: stat for key, stat in whole.items() if stat}
 
 
 def _array(table: pa.Table, key: str, shape: tuple[int, ...]) -> np.ndarray:

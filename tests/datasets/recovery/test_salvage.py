@@ -21,6 +21,7 @@ import pytest
 from bhd_lerobot.datasets.edit.edits import edits_of, keep
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.recovery.repair import repair, restore_committed
+from bhd_lerobot.datasets.recovery.statistics import stats_of
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.datasets.validate.dataset import Severity, check_dataset
 from bhd_lerobot.errors import ConfigError, DatasetCorruptError, DatasetLockedError
@@ -450,3 +451,15 @@ def test_our_own_dataset_that_lerobot_went_on_with(recorded: Recorded, tmp_path:
                 restore_committed(root, Disk())
         assert repair(root).episodes == 3 + count
         assert json.loads((root / "meta/bhd.json").read_text())["recording"]["edited"] == {"edit": "recovered"}
+
+
+def test_statistics_that_only_some_episodes_have_are_left_out() -> None:
+    """Those of depth are not computed, and of an episode whose row is lost there are none."""
+    features = {"x": {"dtype": "float32", "shape": [1]}, "depth": {"dtype": "video", "shape": [4, 4, 1]}}
+    tables = [pa.table({"x": np.arange(3, dtype=np.float32)})] * 2
+    rows = [{"episode_index": index, "length": 3} for index in range(2)]
+    depth = {"depth": {name: np.ones((1, 1, 1)) for name in ("min", "max", "mean", "std", "count")}}
+    for stored, keys in (([depth, {}], {"x"}), ([depth, depth], {"x", "depth"})):
+        found = stats_of(tables, features, Path(), rows, stored)
+        assert found.keys() == keys
+        assert {len(values) for stat in found.values() for values in stat.values()} == {2}
