@@ -3,7 +3,7 @@
 import contextlib
 import itertools
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -127,7 +127,7 @@ class EpisodeLoop:
         self._open_images, self._is_stopped = open_images, stop
         waiting = list(reversed(specs))
         done: dict[int, Episode] = {}
-        order = self._order = [spec.index for spec in specs]
+        self._order = [spec.index for spec in specs]
         n = self.robots.n
         self._specs: list[EpisodeSpec | None] = [None] * n
         self._scenes: list[Any] = [None] * n
@@ -156,14 +156,15 @@ class EpisodeLoop:
                 ids = np.array([sim for sim, _ in finished])
                 self.robots.stop(ids)
                 # Before others start: on the wall clock they would begin while these are still being saved.
-                while order and order[0] in done:
-                    yield done.pop(order.pop(0))
+                yield from self._ready(done)
                 self._start(ids, waiting)
         except RealtimeError as error:
             if self.robots.world is not None:
                 raise
-            # A real robot's fault where no frame can say it: while no episode runs, or before its first frame ends.
+            # A real robot's fault where no frame can say it: its process has ended, or no episode runs.
             self.fault, self.problem = True, self.problem or str(error).removesuffix(".")
+            self._cut_off(done)
+            yield from self._ready(done)
         finally:
             if self.robots.clock is not None:  # it does not go on while the dataset is finished
                 with contextlib.suppress(RealtimeError):
@@ -172,6 +173,18 @@ class EpisodeLoop:
             for episode in done.values():
                 if episode.writer is not None:
                     episode.writer.discard()
+
+    def _ready(self, done: dict[int, Episode]) -> Iterator[Episode]:
+        """Yield the episodes that are done, in their order, up to the first that is not."""
+        while self._order and self._order[0] in done:
+            yield done.pop(self._order.pop(0))
+
+    def _cut_off(self, done: dict[int, Episode]) -> None:
+        """End the episode of a robot that gives no frames any more: what was recorded of it is kept."""
+        if self.robots.running[0] and self._length[0]:
+            self._columns[keys.EVENT][0, self._length[0] - 1] = Event.FAULT
+            episode = self._end(0, Event.FAULT)
+            done[episode.spec.index] = episode
 
     def _take_again(self, waiting: list[EpisodeSpec]) -> None:
         """Discard the running take of the first robot, and start it again."""
@@ -198,6 +211,7 @@ class EpisodeLoop:
             waiting.clear()
             return
         specs = [waiting.pop() for _ in ids]
+        self._length[ids] = 0
         scenes = [self.task.sample(spec.seed) for spec in specs]
         states = self.robots.reset(ids, scenes, [spec.seed for spec in specs])
         self.task.begin(ids, scenes)
@@ -209,7 +223,6 @@ class EpisodeLoop:
             self._specs[sim], self._scenes[sim], self._initial[sim] = spec, scene, state
             self._commands[sim], self._ends[sim], self._streamed[sim] = [], [], []
             self._images.sinks[sim] = self._open_images() if self._open_images and self.robots.camera_shapes else None
-        self._length[ids] = 0
         self._last_frame = -1
         self._drivers.start(ids)
         self.marks.begin(ids)
@@ -359,7 +372,8 @@ class EpisodeLoop:
             timing = TimingStatistics(NANOSECONDS // rates.control_hz)
             timing.add_punctual(length * rates.ticks_per_frame)
             return timing.summary(age=columns[keys.AGE], late=columns[keys.LATE])
-        robots.stop(np.array([sim]))
+        with contextlib.suppress(RealtimeError):  # its process may have ended, which the next call says
+            robots.stop(np.array([sim]))
         measured = FrameTiming(*(columns[key] for key in (keys.TIME, keys.AGE, keys.LATENESS, keys.SKIPPED)))
         columns[keys.LATE] = late_frames(measured, self.tolerance, rates, clock.sensor_period_s)
         return clock.statistics().summary(

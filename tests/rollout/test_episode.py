@@ -1,7 +1,10 @@
 """Brains that plan several frames ahead: what a chunk does is what its actions, sent one by one, would have done."""
 
+import os
+import signal
 import time
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +20,10 @@ from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.rollout.episode import EpisodeLoop
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
+from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.reach import ReachConfig
 from bhd_lerobot.tasks.task import Event
+from tests.robots.host import lying_arm
 from tests.robots.host.support import relaxed, unique
 
 FRAMES = 20
@@ -181,3 +186,29 @@ def test_no_image_is_made_of_frames_that_went_by_unless_somebody_looks() -> None
             frames = len(episode.columns["action"])
             assert brain.frame < frames
             assert len(made) == len(robot.camera_shapes) * (frames if is_watched else brain.frame)
+
+
+def test_what_was_recorded_of_a_robot_whose_process_is_killed_is_an_episode(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv(lying_arm.LOG, str(tmp_path / "shared"))
+    lying_arm.shared(str(tmp_path / "shared"), new=True)
+    plant, realtime = f"{lying_arm.__name__}:LyingArm", relaxed(plant_timeout_s=5.0)
+    config = UR5Config(id=unique("killed"), clock="realtime", plant=plant, control_hz=125, realtime=realtime)
+    home = np.tile(config.body().arm.home, (1000, 1))
+
+    with closing(make_robot(config)) as robot:
+
+        class Killer(Script):
+            def act(self, observation: Any) -> Any:
+                if self.frame == 10:
+                    os.kill(robot.link.pid, signal.SIGKILL)
+                return super().act(observation)
+
+        loop = EpisodeLoop(robot, make_task(FreeConfig("hold still"), 1, 25, config.body()), Killer(home))
+        (episode,) = loop.run([EpisodeSpec(i, 2 * i) for i in range(2)])
+    assert loop.fault
+    assert "was killed by signal 9" in loop.problem
+    assert episode.outcome.event == Event.FAULT
+    assert episode.frames >= 10
+    assert {len(column) for column in episode.columns.values()} == {episode.frames}
+    assert episode.columns[keys.EVENT].tolist() == [0] * (episode.frames - 1) + [Event.FAULT]
+    assert episode.columns[keys.DONE].tolist() == [False] * (episode.frames - 1) + [True]
