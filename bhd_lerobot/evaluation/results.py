@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.evaluation import statistics
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics
 from bhd_lerobot.evaluation.perception import PerceptionSummary, summarise_perception
@@ -256,7 +255,9 @@ def _sum(counts: Any) -> dict[str, int]:
 
 def write_json(path: Path, values: Any) -> None:
     """Write plain values as JSON, all or nothing; numbers that JSON does not have become null."""
-    Disk().publish(path, f"{json.dumps(_finite(values), indent=1, allow_nan=False)}\n".encode())
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    part.replace(path)
 
 
 def write_table(path: Path, episodes: Sequence[EpisodeMetrics]) -> None:

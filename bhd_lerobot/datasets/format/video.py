@@ -244,9 +244,10 @@ def frame_times(path: Path) -> NDArray[np.float64]:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
             shown = [packet.pts for packet in container.demux(stream) if packet.size > 0]
-            return np.sort(np.array([np.nan if pts is None else pts for pts in shown]) * float(stream.time_base or 1))
+            base = float(stream.time_base or 1)
     except (av.error.FFmpegError, IndexError) as error:
         raise OSError(getattr(error, "errno", None), str(error), str(path)) from error
+    return np.sort(np.array([np.nan if pts is None else pts * base for pts in shown]))
 
 
 def stream_signature(path: Path) -> tuple[Any, ...]:
