@@ -25,7 +25,7 @@ class Range:
         self._above, self._below = found[1] == "(", found[4] == ")"
 
     def __str__(self) -> str:
-        low, high = f"{self.low:.10g}", f"{self.high:.10g}"
+        low, high = (f"{one:.0f}" if one.is_integer() else f"{one:.6g}" for one in (self.low, self.high))
         if self.low == -math.inf:
             return "finite"
         if self.high == math.inf:

@@ -169,11 +169,11 @@ def test_recording_uploads_by_the_same_code(hub: FakeHub, tmp_path: Path, capsys
     assert hub.dataset("me/avoid").private
     assert is_generated(text_of(hub, "me/avoid").encode())
     hub.faults = [Fault("/preupload/", times=-1, status=403)]
-    assert record_module.main(record_options(tmp_path / "e", **short, seed=1)) == 2
+    assert record_module.main(record_options(tmp_path / "e", **short | {"dataset__num_episodes": 2})) == 2
     error = capsys.readouterr().err
     assert "no permission" in error
     assert f"bhd-data push {tmp_path / 'e'} me/avoid" in error
-    assert len(dataset_info(tmp_path / "e").episodes) == 1
+    assert len(dataset_info(tmp_path / "e").episodes) == 2
 
 
 def test_recording_does_not_begin_what_cannot_be_uploaded(hub: FakeHub, tmp_path: Path, monkeypatch, capsys) -> None:
