@@ -1,4 +1,4 @@
-"""A UR5 at other rates than its own: it moves freely without an alarm, and stops where it presses."""
+"""Arms at other rates than their own: they move freely without an alarm, and stop where they press."""
 
 from typing import Any
 
@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from lerobot.robots.config import RobotConfig
 
-from bhd_lerobot.bodies.body import Shape
+from bhd_lerobot.bodies.body import Arm, Shape
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.bodies.ur import MODELS, ur
 from bhd_lerobot.control.commands import BrainCommand, ResultCode
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -106,6 +107,34 @@ def test_setpoints_at_the_lowest_rate_are_reached_and_stay_there() -> None:
         for _ in range(3 * arm.rates.fps):
             arm.step(there + way * np.array([1, 1, -1, 1, 1, 1, 0]))
     assert np.abs(arm.cerebellum.command - there)[0, :6].max() < 1e-6
+
+
+@pytest.mark.parametrize(("control_hz", "jerk_limits"), [(100, True), (500, False)])
+def test_a_stream_that_goes_on_while_an_arm_brakes_as_hard_as_it_can_is_no_fault(
+    control_hz: int, jerk_limits: bool
+) -> None:
+    """It fell silent where the end of a range leaves no room for a gentle brake, and it speeds the arm up again."""
+    joint, starts, waits = 4, np.linspace(1.30, 1.36, 25), np.arange(1, 13) * control_hz // 100
+    ways, ticks = (values.ravel() for values in np.meshgrid(starts, waits))
+    n, config = len(ways), SO101Config(control_hz=control_hz, fps=10, jerk_limits=jerk_limits)
+    arm = Simulation(config, n, threads=1)
+    home, limits = arm.body.need(Arm).home, arm.body.limits
+    goal = np.tile(home, (n, 1))
+    goal[:, joint] = limits.upper[joint] - ways
+    arm.reset(np.arange(n), [TableScene("empty", (), tuple(row)) for row in goal.tolist()], [0] * n)
+    arm.controller.arm_limits["keeps_clear"] = False  # the table is near
+    goal[:, joint] = limits.upper[joint]
+    hardest, since = 0.0, 0
+    for _ in range(4):
+        assert arm.bridge.send(goal).accepted.all()
+        arm.bridge.advance_frame()
+    while since <= waits[-1]:
+        since += bool(since or (arm.modes == Mode.STOPPING).any())
+        hardest = max(hardest, -float(arm.controller.acceleration[:, joint].min()))
+        arm.bridge.send(goal, ticks == since)
+        arm.bridge.advance_ticks(1)
+    assert hardest == pytest.approx(limits.stop_deceleration[joint])
+    assert (arm.cerebellum.take_flags()[1] == Watchdog.COMMAND_AGE).all()
 
 
 RATES_REFUSED = {

@@ -133,6 +133,7 @@ class ArmController(Controller):
         self._reach = (arm.blocked_rad + speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:dof]
         self._damping, self._effort = np.asarray(arm.servo_damping), np.asarray(limits.effort)
         self._lower, self._upper, self._speed = np.asarray(limits.lower), np.asarray(limits.upper), speed
+        self._hardest = np.maximum(limits.acceleration, limits.stop_deceleration)
         # As the functions of a tick take them.
         self._state_of, self._arm_of = as_objects(states), as_objects(arms)
         self._geometry_of, [self._limits_of] = as_objects(self.geometries), as_objects(self.arm_limits)
@@ -228,8 +229,11 @@ class ArmController(Controller):
             if self.goals.following[sim] and not self.arms["follows_setpoints"][sim]:
                 # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at
                 # one speed. Going on from the speed at the end would change the command's own by half a tick's
-                # acceleration on top of what is allowed.
-                self.velocity[sim] -= self.acceleration[sim] * (0.5 / self._hz)
+                # acceleration on top of what is allowed. Of a brake as hard as a stop's it is less: the lead turns with
+                # the speed, and may turn by what a stop makes of it.
+                rate = self.acceleration[sim]
+                most = np.maximum(4 * self._hardest - 2 * (self._limits["hardest"][: self.width] + np.abs(rate)), 0.0)
+                self.velocity[sim] -= np.clip(rate, -most, most) * (0.5 / self._hz)
             message = "A setpoint came, and the newer command counts."
             self.goals.end_all(sim, ResultCode.REPLACED_BY_SETPOINT, message)
         take_setpoint(self._state_of[sim], self._arm_of[sim], self._limits_of)
