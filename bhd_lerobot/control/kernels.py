@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 _is_plain = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 _LOCK = RLock()  # numba's cache folder is set for the whole process
 # The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
-_CODE = b"".join(source.read_bytes() for source in sorted(Path(__file__).parent.rglob("*.py")))
+_SIM = Path(__file__).parents[1] / "sim"
+_SOURCES = *sorted(Path(__file__).parent.rglob("*.py")), _SIM / "frames.py", _SIM / "plant.py"
+_CODE = b"".join(source.read_bytes() for source in _SOURCES)
 
 
 RECORDS: dict[str, np.dtype[Any]] = {}

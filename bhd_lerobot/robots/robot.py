@@ -128,6 +128,8 @@ class BhdRobot(Robot):
                 inputs.add(*source)
             self._host = make_live(self.simulation_class, self.config, self.id) if is_live else self.make_simulation()
             inputs.attach(self._host.estop)
+            if not is_live:  # whose other process has done it
+                self._host.load()  # now, and not for the first action, in the middle of an episode
             self.restart()
             for name in self.camera_shapes:
                 self._host.render(0, name)

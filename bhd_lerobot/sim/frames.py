@@ -489,7 +489,7 @@ class Frames:
             False if nothing was done, as `run`; also if there are more robots.
         """
         own = self._cerebellum
-        if not self._is_prepared or own.plant is not self._plant:
+        if not self._is_prepared or own.plant is not self._plant or is_plain():
             self._is_prepared = self._world.n == 1 and self._is_ready()
             if not self._is_prepared:
                 return False
@@ -559,7 +559,7 @@ class Frames:
                 if len(ids):
                     self._cerebellum.serve(ids)
             return
-        shares = np.array_split(ids, min(len(ids), _SHARES * len(self._threads)))
+        shares = np.array_split(ids, max(min(len(ids), _SHARES * len(self._threads)), 1))
         jobs = {self._pool.submit(self._run_share, share, ticks) for share in shares}
         try:
             while jobs:

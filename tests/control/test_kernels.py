@@ -186,6 +186,14 @@ def test_no_kernel_raises_to_a_power() -> None:
                 assert not powers, f"{path}: {one.name}"
 
 
+@pytest.mark.law
+def test_no_machine_code_outlives_a_change_of_a_kernel() -> None:
+    """The cache's folder is named by the code of all kernels: numba looks at the file of the outermost one alone."""
+    for path in sorted((ROOT / "bhd_lerobot").rglob("*.py")):
+        code = path.read_bytes()
+        assert b"\n@kernel(" not in code or code in kernels._CODE, path
+
+
 @pytest.mark.parametrize("make", [base_rig, twist_rig, arm])
 def test_what_was_loaded_compiles_nothing_in_a_loop_on_the_wall_clock(make: Callable[[], Any]) -> None:
     from numba.core.event import install_recorder

@@ -13,6 +13,7 @@ from bhd_lerobot.errors import ActionError, CommandRefusedError, ConfigError
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
+from bhd_lerobot.sim.frames import run_base_frames
 from tests.cases import each_case
 
 GO = {"x.vel": 0.2, "theta.vel": 0.0}
@@ -47,6 +48,15 @@ def test_bad_actions_are_refused_and_nothing_happens(robot):
             robot.send_action(action)
     assert np.array_equal(robot.host.physics_state, before)
     assert robot.host.bridge.now_ns == now
+
+
+def test_what_runs_an_action_is_compiled_before_the_first_one(tmp_path, monkeypatch):
+    """It may take half a minute: an episode of `lerobot-record`, which is timed by the wall clock, would be over."""
+    monkeypatch.delitem(vars(run_base_frames), "compiled", raising=False)
+    with make(tmp_path, arena="empty") as robot:
+        before = vars(run_base_frames)["compiled"]
+        robot.send_action(GO)
+        assert vars(run_base_frames)["compiled"] is before
 
 
 def test_out_of_range_actions_are_limited_in_the_return_value(robot):

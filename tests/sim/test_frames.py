@@ -2,6 +2,7 @@
 
 import threading
 import time
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ def run(
         efforts = report.columns["control.effort"]
         every = np.concatenate([seen.state, report.applied, flags, efforts, simulation.physics_state], axis=1)
         rows.append(np.where(simulation.running[:, None], every, 0.0))  # of robots that were left alone nothing is said
-    assert alone is None or simulation._frames._one_tick is not None
+    assert alone is None or simulation._frames._is_prepared
     simulation.close()
     return np.array(rows)
 
@@ -165,7 +166,7 @@ class Reacher:
             every += [true.tool_pose, self.arm.physics_state]
             row = np.concatenate(every, axis=1)
             rows.append(np.where(self.arm.running[:, None], row, 0.0))
-        assert not self.alone or self.arm._frames._one_tick is not None
+        assert not self.alone or self.arm._frames._is_prepared
         self.arm.close()
         return np.array(rows)
 
@@ -283,6 +284,27 @@ def test_whatever_comes_between_two_ticks_that_run_alone_it_counts_at_once(what:
     fast = after(what)
     with kernels.plain_python():
         np.testing.assert_array_equal(fast, after(what))
+
+
+def test_a_tick_alone_is_plain_python_while_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation, calls = make(1), count_calls(monkeypatch)
+    for tick in range(3):
+        with kernels.plain_python() if tick == 1 else nullcontext():
+            simulation.run_tick(tick * 5_000_000, 1)
+        assert len(calls) == (tick + 2) // 2
+    simulation.close()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_frame_of_robots_that_are_all_left_alone_moves_none(threads: int) -> None:
+    simulation = make(2, threads)
+    simulation.step(np.full((2, 2), 0.1))
+    simulation.stop(np.arange(2))
+    before, tick = simulation.physics_state, simulation.tick
+    simulation.step(np.full((2, 2), 0.1))
+    np.testing.assert_array_equal(simulation.physics_state, before)
+    assert simulation.tick == tick + simulation.rates.ticks_per_frame
+    simulation.close()
 
 
 FIELDS = ("xfrc_applied", "qacc_warmstart", "ncon", "xquat", "qfrc_bias", "actuator_force")
