@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.robots.config import RobotConfig
+from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Shape
 from bhd_lerobot.bodies.tabletop import TableScene
@@ -109,32 +110,59 @@ def test_setpoints_at_the_lowest_rate_are_reached_and_stay_there() -> None:
     assert np.abs(arm.cerebellum.command - there)[0, :6].max() < 1e-6
 
 
+PAN, ROLL = 0, 4  # joints of an SO-101: of the smallest accelerations, and of the largest
+
+
+def turning(joint: int, ways: NDArray[np.float64], **options: Any) -> tuple[Simulation, NDArray[np.float64]]:
+    """Return SO-101 with a joint so far from the end of its range, and setpoints of that end."""
+    arm = Simulation(SO101Config(fps=10, **options), len(ways), threads=1)
+    end = np.tile(arm.body.need(Arm).home, (len(ways), 1))
+    end[:, joint] = arm.body.limits.upper[joint]
+    starts = end.copy()
+    starts[:, joint] -= ways
+    scenes = [TableScene("empty", (), tuple(row)) for row in starts.tolist()]
+    arm.reset(np.arange(len(ways)), scenes, [0] * len(ways))
+    arm.controller.arm_limits["keeps_clear"] = False  # the table is near
+    return arm, end
+
+
+def resume(arm: Simulation, setpoints: NDArray[np.float64], waits: NDArray[np.int64]) -> float:
+    """Send setpoints so many ticks after the first stop begins; return the hardest brake until then, as a share."""
+    since, hardest = 0, 0.0
+    while since <= waits.max():
+        since += bool(since or (arm.modes == Mode.STOPPING).any())
+        hardest = max(hardest, -float(arm.controller.acceleration[:, ROLL].min()))
+        arm.bridge.send(setpoints, waits == since)
+        arm.bridge.advance_ticks(1)
+    return hardest / arm.body.limits.stop_deceleration[ROLL]
+
+
 @pytest.mark.parametrize(("control_hz", "jerk_limits"), [(100, True), (500, False)])
 def test_a_stream_that_goes_on_while_an_arm_brakes_as_hard_as_it_can_is_no_fault(
     control_hz: int, jerk_limits: bool
 ) -> None:
     """It fell silent where the end of a range leaves no room for a gentle brake, and it speeds the arm up again."""
-    joint, starts, waits = 4, np.linspace(1.30, 1.36, 25), np.arange(1, 13) * control_hz // 100
-    ways, ticks = (values.ravel() for values in np.meshgrid(starts, waits))
-    n, config = len(ways), SO101Config(control_hz=control_hz, fps=10, jerk_limits=jerk_limits)
-    arm = Simulation(config, n, threads=1)
-    home, limits = arm.body.need(Arm).home, arm.body.limits
-    goal = np.tile(home, (n, 1))
-    goal[:, joint] = limits.upper[joint] - ways
-    arm.reset(np.arange(n), [TableScene("empty", (), tuple(row)) for row in goal.tolist()], [0] * n)
-    arm.controller.arm_limits["keeps_clear"] = False  # the table is near
-    goal[:, joint] = limits.upper[joint]
-    hardest, since = 0.0, 0
+    ticks = np.arange(1, 13) * control_hz // 100
+    ways, waits = (values.ravel() for values in np.meshgrid(np.linspace(1.30, 1.36, 25), ticks))
+    arm, end = turning(ROLL, ways, control_hz=control_hz, jerk_limits=jerk_limits)
     for _ in range(4):
-        assert arm.bridge.send(goal).accepted.all()
+        assert arm.bridge.send(end).accepted.all()
         arm.bridge.advance_frame()
-    while since <= waits[-1]:
-        since += bool(since or (arm.modes == Mode.STOPPING).any())
-        hardest = max(hardest, -float(arm.controller.acceleration[:, joint].min()))
-        arm.bridge.send(goal, ticks == since)
-        arm.bridge.advance_ticks(1)
-    assert hardest == pytest.approx(limits.stop_deceleration[joint])
+    assert resume(arm, end, waits) == pytest.approx(1.0)
     assert (arm.cerebellum.take_flags()[1] == Watchdog.COMMAND_AGE).all()
+
+
+@pytest.mark.parametrize("wait", [1, 2, 3])
+def test_a_stream_that_goes_on_when_a_stop_has_just_begun_is_no_fault(wait: int) -> None:
+    arm, end = turning(PAN, np.full(1, 3.0), control_hz=100, stale_after_s=0.02)
+    for way in (0.0, 0.0, 0.0, -4.0):
+        there = end.copy()
+        there[:, PAN] += way
+        assert arm.bridge.send(there).accepted.all()
+        arm.bridge.advance_frame()
+    resume(arm, end, np.full(1, wait))
+    arm.bridge.advance_frame()
+    assert int(arm.cerebellum.take_flags()[1][0]) & ~Watchdog.COMMAND_AGE == 0
 
 
 RATES_REFUSED = {

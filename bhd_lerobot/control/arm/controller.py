@@ -121,7 +121,8 @@ class ArmController(Controller):
         # that is wrong moves an arm no farther.
         self._aim, self._top = np.zeros((2, n, dof))
         self._first = np.full((n, width), np.nan)  # where the arms were when they were activated
-        self._bend = 0.9 * WireLimits.of(body, control_hz).bend[:width]
+        self._most_bend = WireLimits.of(body, control_hz).bend[:width]
+        self._bend = 0.9 * self._most_bend
         self._blocked = f"The arm stayed more than {arm.blocked_rad} rad from its reference: something is in its way."
         self._misread = (
             f"The arm was read more than {arm.blocked_rad} rad from its reference, and its motors do not press: an "
@@ -133,7 +134,6 @@ class ArmController(Controller):
         self._reach = (arm.blocked_rad + speed * (arm.blocked_s + self._lead + 1.0 / control_hz))[:dof]
         self._damping, self._effort = np.asarray(arm.servo_damping), np.asarray(limits.effort)
         self._lower, self._upper, self._speed = np.asarray(limits.lower), np.asarray(limits.upper), speed
-        self._hardest = np.maximum(limits.acceleration, limits.stop_deceleration)
         # As the functions of a tick take them.
         self._state_of, self._arm_of = as_objects(states), as_objects(arms)
         self._geometry_of, [self._limits_of] = as_objects(self.geometries), as_objects(self.arm_limits)
@@ -227,16 +227,25 @@ class ArmController(Controller):
         """Head for a new setpoint; goals that are still followed end, because the newer command counts."""
         if self.busy[sim]:
             if self.goals.following[sim] and not self.arms["follows_setpoints"][sim]:
-                # A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at
-                # one speed. Going on from the speed at the end would change the command's own by half a tick's
-                # acceleration on top of what is allowed. Of a brake as hard as a stop's it is less: the lead turns with
-                # the speed, and may turn by what a stop makes of it.
-                rate = self.acceleration[sim]
-                most = np.maximum(4 * self._hardest - 2 * (self._limits["hardest"][: self.width] + np.abs(rate)), 0.0)
-                self.velocity[sim] -= np.clip(rate, -most, most) * (0.5 / self._hz)
+                self.velocity[sim] = self._speed_after_trajectory(sim)
             message = "A setpoint came, and the newer command counts."
             self.goals.end_all(sim, ResultCode.REPLACED_BY_SETPOINT, message)
         take_setpoint(self._state_of[sim], self._arm_of[sim], self._limits_of)
+
+    def _speed_after_trajectory(self, sim: int) -> Array:
+        """Return the speeds that setpoints go on from after a trajectory, shape (width,).
+
+        A trajectory's command is where a smooth motion is at the end of a tick; a setpoint's goes a tick at one speed.
+        Going on from the speed at the end would change the command's own by half a tick's acceleration on top of what
+        is allowed. The lead turns with it: however the next tick accelerates, what is written bends no more than the
+        guard permits.
+        """
+        state, width = self.states[sim], self.width
+        change = self._limits["hardest"][:width] / self._hz
+        most, gain = 0.99 * self._most_bend, 1.0 / self._hz + self._lead  # of what is written, by the speed
+        even = (state["written"][:width] + state["written_rate"][:width] - self.command[sim]) / gain
+        speed = self.velocity[sim] - self.acceleration[sim] * (0.5 / self._hz)
+        return np.clip(speed, even - most / gain + change, even + most / gain - change)
 
     def _stop(self, sim: int, cause: Mode) -> None:
         """Decelerate to rest; all goals end, with the cause as their result."""

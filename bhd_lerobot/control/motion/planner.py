@@ -145,7 +145,7 @@ class GoalPlanner:
         if command.joint_target is not None:
             return self._plan_joints(command, np.asarray(command.joint_target, np.float64), state)
         if state.moving:
-            brake = to_rest(state, self.limits[self._arm], self.hz)
+            brake = to_rest(state, self.limits[self._arm], self.hz, self.stop_limits[self._arm])
             return brake if isinstance(brake, PlanFailure) else self._checked(brake, state)
         return at_once(state.position)
 
@@ -157,9 +157,10 @@ class GoalPlanner:
             1.0 if change is None else change / limits.acceleration.max(),
         )
         # An arm that is already faster than the goal permits may need more than the goal's deceleration at an end of
-        # the joints' range.
+        # the joints' range, and one that speeds up that of a stop, see `brake`.
+        brakes = limits, self.stop_limits[self._arm]
         trajectory = self._within_torque(
-            lambda share: to_target(state, target, scaled.scaled(1.0, share), self.hz, limits)
+            lambda share: to_target(state, target, scaled.scaled(1.0, share), self.hz, *brakes)
         )
         return trajectory if isinstance(trajectory, PlanFailure) else self._checked(trajectory, state)
 
@@ -179,7 +180,7 @@ class GoalPlanner:
         limits = self.limits[self._arm]
         tool = ToolLimits(command.max_velocity or MAX_TOOL_SPEED, command.max_acceleration or MAX_TOOL_ACCELERATION)
         # A line starts where the tool can be on it: at rest.
-        brake = to_rest(state, limits, self.hz) if state.moving else None
+        brake = to_rest(state, limits, self.hz, self.stop_limits[self._arm]) if state.moving else None
         if isinstance(brake, PlanFailure):
             return brake
         start = state.position if brake is None else brake.target
@@ -223,13 +224,13 @@ class GoalPlanner:
     # --- the gripper -------------------------------------------------------------------------------------------------
 
     def _plan_gripper(self, opening: float | None, state: State) -> Trajectory | PlanFailure:
-        limits = self.limits[self._gripper]
+        limits, stop = self.limits[self._gripper], self.stop_limits[self._gripper]
         if opening is None and state.moving:
-            return to_rest(state, limits, self.hz)
+            return to_rest(state, limits, self.hz, stop)
         target = np.clip(state.position if opening is None else opening, limits.lower, limits.upper)
         if not state.moving and (target == state.position).all():
             return at_once(target)
-        return to_target(state, np.broadcast_to(target, (1,)), limits, self.hz)
+        return to_target(state, np.broadcast_to(target, (1,)), limits, self.hz, limits, stop)
 
     # --- collisions --------------------------------------------------------------------------------------------------
 

@@ -163,7 +163,11 @@ class Trajectory:
 
 
 def to_target(
-    start: State, target: ArrayLike, limits: MotionLimits, hz: int, brake_limits: MotionLimits | None = None
+    start: State,
+    target: ArrayLike,
+    limits: MotionLimits,
+    hz: int,
+    *brake_limits: MotionLimits,
 ) -> Trajectory | PlanFailure:
     """Return the quickest trajectory to rest at a target on which all dimensions arrive together.
 
@@ -173,7 +177,8 @@ def to_target(
     Args:
         target: the end [rad or m], within the position limits, shape (dof,).
         hz: ticks a second [Hz].
-        brake_limits: the limits to brake with if gentler ones do not suffice; `limits` if None.
+        brake_limits: the limits to brake with if gentler ones do not suffice, and those where these do not either;
+            `limits` if there are none.
     """
     goal = np.asarray(target, np.float64)
     first = _calculate(start, goal, limits, hz, "Phase")
@@ -184,7 +189,8 @@ def to_target(
         if _stays_within(first, start, limits):
             return first
     # Rounding may have put a state a hair outside of what Ruckig takes; or it came too close to a position limit.
-    brake = to_rest(start, limits if brake_limits is None else brake_limits, hz)
+    gentle, *hard = brake_limits or (limits,)
+    brake = to_rest(start, gentle, hz, *hard)
     if isinstance(brake, PlanFailure):
         return first if isinstance(first, PlanFailure) else brake
     second = _calculate(State.at_rest(brake.target), goal, limits, hz, "Phase")

@@ -11,12 +11,12 @@ from bhd_lerobot.control.commands import BrainCommand, Pose, ResultCode
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics, IkResult
 from bhd_lerobot.control.geometry.poses import pose_vectors
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan, PlanFailure
-from bhd_lerobot.control.motion.trajectory import State
+from bhd_lerobot.control.motion.trajectory import MotionLimits, State
 from bhd_lerobot.robots.config_arm import SO101Config
 from bhd_lerobot.sim.chain import chain_from_mjcf
 from tests.cases import each_case
 from tests.control.geometry.arm_models import serial
-from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, ZEROS, joints, moved
+from tests.control.goal_rig import ARM, HOME, HZ, KINEMATICS, LIMITS, STOP_LIMITS, ZEROS, Array, joints, moved
 
 PLANNER = GoalPlanner(ARM, HZ)
 NAN, INF = float("nan"), float("inf")
@@ -143,6 +143,26 @@ def test_a_gentle_goal_does_not_carry_a_fast_arm_past_its_range() -> None:
     assert start.velocity[5] > 1.0
     gentle = made(start, joint_target=joints(), max_acceleration=0.5).trajectory
     assert np.abs(gentle.position).max() <= 2 * np.pi + 1e-9
+
+
+@pytest.mark.law
+@pytest.mark.parametrize(
+    "fields", [{"joint_target": joints(), "gripper": 0.0}, {"gripper": 0.03}, {"joint_target": joints()}]
+)
+def test_a_goal_that_comes_where_only_a_stop_s_brake_ends_in_time_leaves_no_range(fields: dict[str, Any]) -> None:
+    """A setpoint's reference may be there, of few ticks a second; the guard would stop an arm that went on."""
+
+    def ways(limits: MotionLimits) -> Array:
+        return speed * speed / (2 * limits.acceleration) + speed * limits.acceleration / (2 * limits.jerk)
+
+    ends, speed = [5, 6], 0.9 * LIMITS.velocity
+    position, velocity = HOME.copy(), ZEROS.copy()
+    position[ends] = (LIMITS.upper - (ways(LIMITS) + ways(STOP_LIMITS)) / 2)[ends]
+    velocity[ends] = speed[ends]
+    planned = made(State(position, velocity, ZEROS), **fields).trajectory
+    assert (planned.position <= LIMITS.upper + 1e-9).all()
+    change = np.diff(np.concatenate((velocity[None], planned.velocity)), axis=0) * HZ
+    assert (np.abs(change) <= STOP_LIMITS.acceleration * 1.001).all()
 
 
 @pytest.mark.parametrize(
