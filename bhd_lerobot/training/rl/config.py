@@ -214,6 +214,7 @@ class RlConfig(Options):
         self._check_reward()
         _ = self.policy.actor()
         check_task(self.task, self.robot)
+        _ = self.environment
         if self.validation.seed == self.seed:
             raise ConfigError(
                 f"validation.seed and seed are both {self.seed}; the policy would be evaluated on its training "
@@ -236,8 +237,15 @@ class RlConfig(Options):
     @property
     def environment(self) -> str:
         """Name of the environment of this robot and task."""
-        task = self.task.get_choice_name(type(self.task))
-        return next(name for name, pair in ENVIRONMENTS.items() if pair == (self.robot.type, task))
+        wanted = self.robot.type, self.task.get_choice_name(type(self.task))
+        for name, pair in ENVIRONMENTS.items():
+            if pair == wanted:
+                return name
+        raise ConfigError(
+            f"robot.type is {wanted[0]!r} and task.type is {wanted[1]!r}, of which there is no environment. There is: "
+            f"{', '.join(map(' with '.join, ENVIRONMENTS.values()))}. Choose one of these, or register another with "
+            "bhd_lerobot.register_environment."
+        )
 
     def _check_reward(self) -> None:
         for event in self.reward.events:

@@ -288,6 +288,12 @@ WRONG: list[tuple[dict[str, object], str]] = [
 ]
 
 
+def test_a_robot_and_a_task_without_an_environment_are_refused_by_name() -> None:
+    pair = {"robot__type": "ur5e", "robot__beams": None, "task__type": "reach", "policy__scan__transform": None}
+    with pytest.raises(ConfigError, match=r"'ur5e' and task.type is 'reach', of which .* There is: .*ur5 with reach"):
+        parse_rl(options(**pair))
+
+
 def test_wrong_values_are_named() -> None:
     for overrides, message in WRONG:
         with pytest.raises(ConfigError, match=message):
