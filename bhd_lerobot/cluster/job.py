@@ -179,7 +179,8 @@ def fingerprint(robot: Any, task: Any, fps: int) -> str:
 
     Equal versions are not enough: another processor may take other instructions for the same sine.
     """
-    simulation = make_simulation(dataclasses.replace(robot, camera=False), 1)
+    joints = {"control": "servo", "action_space": "joint"} if hasattr(robot, "action_space") else {}  # with ranges
+    simulation = make_simulation(dataclasses.replace(robot, camera=False, **joints), 1)
     brain = _Listener()
     loop = EpisodeLoop(simulation, make_task(task, 1, fps, simulation.body), brain)
     for _ in loop.run([EpisodeSpec(0, 0)], lambda: brain.frames >= _PROBE_FRAMES):

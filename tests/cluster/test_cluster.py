@@ -19,14 +19,16 @@ from bhd_lerobot.cli.record import main
 from bhd_lerobot.cluster import loop, pool
 from bhd_lerobot.cluster.cluster import describe_crowding
 from bhd_lerobot.cluster.config import RayConfig
-from bhd_lerobot.cluster.job import Job
+from bhd_lerobot.cluster.job import Job, fingerprint
 from bhd_lerobot.cluster.loop import open_pool
 from bhd_lerobot.cluster.pool import Task
 from bhd_lerobot.datasets.format.video import count_frames
 from bhd_lerobot.errors import ActionError, ClusterError
 from bhd_lerobot.evaluation import evaluate as evaluate_module
 from bhd_lerobot.recording import record as record_module
+from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.rollout.tolerance import TimingTolerance
+from bhd_lerobot.tasks.reach import ReachConfig
 from tests.cluster import fakes
 from tests.evaluation.test_brains import checkpoint  # noqa: F401  (a fixture)
 from tests.evaluation.test_evaluate import FAILING, run_eval
@@ -45,6 +47,12 @@ ARM = {
     "robot__camera_height": 48,
     "dataset__repo_id": "test/reach",
 }
+
+
+def test_the_fingerprint_of_an_arm_does_not_depend_on_how_it_is_commanded():
+    task = ReachConfig()
+    tool, soft = (UR5Config(action_space="tool", control=one) for one in ("servo", "impedance"))
+    assert len({fingerprint(robot, task, 25) for robot in (UR5Config(), tool, soft)}) == 1
 
 
 @pytest.fixture(scope="module")
