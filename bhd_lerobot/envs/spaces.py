@@ -65,19 +65,20 @@ class ActionScale:
                 f"The action has shape {values.shape} and type {values.dtype}; it needs {shape} numbers: "
                 f"{', '.join(self.names)} of each of {shape[0]} simulation(s)."
             )
-        # The sum of 0 * x is 0 if and only if every x is finite.
+        with np.errstate(over="ignore"):  # what single precision does not hold is not finite in it
+            values = values.astype(np.float32)
+            if self._normalise:
+                values = (self._middle + self._half * values.astype(np.float64)).astype(np.float32)
         if not np.isfinite(values).all():
             bad = np.argwhere(~np.isfinite(values) & running[:, None])
             if len(bad):
                 sim, column = bad[0]
                 raise ActionError(
-                    f"The action {self.names[column]!r} of environment {sim} is {values[sim, column]}; "
-                    "actions must be finite numbers."
+                    f"The action {self.names[column]!r} of environment {sim} is {np.asarray(actions)[sim, column]}; "
+                    "actions must be finite numbers in single precision."
                 )
-            values = np.where(running[:, None], values, 0.0)
-        if self._normalise:
-            values = self._middle + self._half * values.astype(np.float32).astype(np.float64)
-        return values.astype(np.float32).astype(np.float64)
+            values = np.where(running[:, None], values, np.float32(0.0))
+        return values.astype(np.float64)
 
 
 def action_bounds(body: Body, names: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

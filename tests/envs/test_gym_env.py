@@ -109,6 +109,7 @@ def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: st
     [
         ([0.1, np.nan], "'theta.vel' of environment 0 is nan"),
         ([np.inf, 0.0], "'x.vel' of environment 0 is inf"),
+        ([1e39, 0.0], "'x.vel' of environment 0 is 1e+39; actions must be finite numbers in single precision"),
         ([0.1], "shape (1, 1)"),
         (0.1, "shape (1,)"),
         (["fast", "left"], "needs (1, 2) numbers: x.vel, theta.vel"),
