@@ -1,7 +1,7 @@
 """From the command line of `bhd-train` to its configuration: also `policy.path`, and `resume` from a checkpoint."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> BhdTrai
         checkpoint = _resumed(line.path, line.options.get("output_dir"))
         values = _read_checkpoint(checkpoint)
         values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
+        _refuse_ignored(line.options, values)
     else:
         values = line.file
     if any(key.startswith("policy.") for key in line.options) and not isinstance(values.get("policy"), dict):
@@ -58,6 +59,20 @@ def resumed_checkpoint(path: Path) -> Path:
         f"No checkpoint to resume at {path}: neither {TRAIN_CONFIG_NAME} in it, nor in {PRETRAINED_MODEL_DIR}/, nor "
         f"in {CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}/."
     )
+
+
+def _refuse_ignored(options: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Refuse options that a resumed run does not take: where it started, and what its optimizer's state says."""
+    for name, wanted in options.items():
+        is_of_optimizer = name.startswith(("policy.optimizer_", "optimizer.")) and name != "optimizer.grad_clip_norm"
+        was: Any = values
+        for key in name.split("."):
+            was = was.get(key) if isinstance(was, Mapping) else None
+        if (is_of_optimizer or name in ("fine_tune", "policy.path")) and wanted != was:
+            raise ConfigError(
+                f"{name} is {wanted!r}, and a run that is resumed continues with {was!r}. Leave it out, or start a new "
+                "run with --fine_tune=CHECKPOINT."
+            )
 
 
 def _read_checkpoint(checkpoint: Path) -> dict[str, Any]:

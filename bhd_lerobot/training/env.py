@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from bhd_lerobot.envs.register import ENVIRONMENTS
+from bhd_lerobot.envs.register import ENVIRONMENTS, NAMESPACE
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.stock import (
     close_envs,
@@ -87,7 +87,7 @@ class EnvEvaluation:
 
 
 def _check_robot(config: BhdTrainConfig, robot: str | None) -> None:
-    pair = ENVIRONMENTS.get(str(getattr(config.env, "task", None)))
+    pair = ENVIRONMENTS.get(str(getattr(config.env, "task", None)).removeprefix(f"{NAMESPACE}/"))
     if robot is not None and pair is not None and pair[0] != robot:
         fitting = ", ".join(sorted(name for name, (kind, _) in ENVIRONMENTS.items() if kind == robot)) or "none"
         raise ConfigError(

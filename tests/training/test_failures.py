@@ -205,9 +205,24 @@ def test_weights_that_are_damaged_are_named(data: Path, trained: Path, tmp_path:
 
 def test_an_environment_of_another_robot(tmp_path: Path) -> None:
     root = make_dataset(tmp_path / "set", episodes=2, robot="ur5")
-    env = {"env__type": "bhd", "env__task": "TurtleBot3Avoid-v0", "env_eval_freq": 2}
-    message = r"env.task is 'TurtleBot3Avoid-v0', which is for a turtlebot3; .* Valid: UR5Pick-v0, UR5Reach-v0"
-    refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
+    for namespace in ("", "bhd_lerobot/"):
+        env = {"env__type": "bhd", "env__task": f"{namespace}TurtleBot3Avoid-v0", "env_eval_freq": 2}
+        message = r"env.task is '.*TurtleBot3Avoid-v0', which is for a turtlebot3; .* Valid: UR5Pick-v0, UR5Reach-v0"
+        refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
+
+
+def test_what_a_resumed_run_would_ignore_is_refused(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "run", MLP, steps=5))
+    resume = ["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=7"]
+    for name, value, was in (
+        ("policy.optimizer_lr", 0.5, 0.001),
+        ("optimizer.weight_decay", 0.5, 0.0001),
+        ("policy.path", "elsewhere", None),
+        ("fine_tune", "elsewhere", None),
+    ):
+        with pytest.raises(ConfigError, match=f"{name} is {value!r}, and a run that is resumed .* {was!r}"):
+            run_train([*resume, f"--{name}={value}"])
+    run_train([*resume, "--policy.optimizer_lr=0.001", "--optimizer.grad_clip_norm=2.0"])
 
 
 def test_what_is_chosen_by_while_training_is_not_what_is_reported(tmp_path, monkeypatch):
