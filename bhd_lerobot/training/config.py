@@ -40,9 +40,10 @@ class SelectionConfig(Options, prefix="selection."):
         outcome: episodes with these outcomes: `all`, or events that an episode can end with, such as `success`.
         min_score: episodes with at least this score, 0 to 1; by default any.
         exclude_late: leave out episodes with more late frames than their recording tolerated.
-        intervention_weight: sampling weight of frames in which someone intervened, relative to others; 0 drops them.
+        intervention_weight: sampling weight of frames in which someone intervened, relative to others; 0 drops them:
+            chunks of actions end before them, as they do at an episode's end.
         learner_weight: sampling weight of frames that a learner drove while someone could have intervened, relative to
-            others; 0 drops them, so that only the expert's own driving is learned.
+            others; 0 drops them likewise, so that only the expert's own driving is learned.
         expert_action: learn the expert's action of every frame, `expert.action`, instead of the executed one.
         hold_out: unit of `dataset.eval_split`: `episode`, a share of all episodes; `instruction`, a share of each
             instruction's episodes, at least one of each, as `lerobot-train` does.

@@ -1,5 +1,6 @@
 """Rows of a table and its images as batches, with windows in time and their padding masks."""
 
+import copy
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -63,6 +64,13 @@ class Gatherer:
             found[f"{key}_is_pad"] = torch.from_numpy(pads[delta].copy())
         found["task"] = [self._tasks[task] for task in found["task_index"].tolist()]
         return found
+
+    def ending_before(self, rows: Tensor) -> "Gatherer":
+        """Return one whose windows end before some rows of the table, as they do where an episode ends."""
+        stops = np.append(np.sort(rows.numpy()), len(self._last))
+        one = copy.copy(self)
+        one._last = np.minimum(self._last, stops[np.searchsorted(stops[:-1], np.arange(len(self._last)), "right")] - 1)
+        return one
 
     def _windowed(self, rows: NDArray) -> tuple[dict[tuple[int, ...], NDArray], dict[tuple[int, ...], NDArray]]:
         """Return the rows of every window, clamped to the episode, and which of them were clamped; shape (B, n)."""

@@ -109,8 +109,10 @@ def make_loader(
             dataset.set_image_transforms(transforms)
             index, task = (dataset.table.columns[key][dataset.rows] for key in ("index", "task_index"))
         samples = choose(index, task)
-        if order.get("weights") is not None:
-            order["weights"] = order["weights"][samples]
+        if (weights := order.get("weights")) is not None:
+            if (left_out := weights == 0).any():
+                dataset = _ending_before(dataset, left_out, config, reason)
+            order["weights"] = weights[samples]
         deal = BatchOrder(samples, config.batch_size, rank=config.rank, world_size=config.world_size, **order)
         if whole is None:
             return LeRobotLoader(dataset, deal, config.device, config.num_workers)
@@ -196,6 +198,20 @@ def _check_positions(dataset: Any, episodes: Sequence[int], reason: str) -> None
             "files for frame i, which it is not here: it would serve frames of other episodes. Run `bhd-data check "
             f"--fix {quoted(root)}`, or raise budget_gib."
         )
+
+
+def _ending_before(dataset: Any, left_out: Tensor, config: LoaderConfig, reason: str) -> Any:
+    """Return a dataset whose windows end before the samples that are left out: what was done there is not learned."""
+    if isinstance(dataset, TableDataset):
+        return dataset.ending_before(left_out)
+    for key, times in (config.delta_timestamps or {}).items():
+        if max(times) > 0:
+            raise ConfigError(
+                f"A weight of frames is 0, and {key!r} is learned in chunks, which are not to reach into the frames "
+                f"that are left out; LeRobot's own loader, which is needed because {reason}, cannot end them there. "
+                "Raise budget_gib, or set a small weight in place of 0."
+            )
+    return dataset
 
 
 def _first_frames(index: Tensor, meta: Any, drop_n_last_frames: int) -> Tensor:

@@ -147,6 +147,12 @@ class TableDataset:
         part._rows = torch.isin(self.table.columns["episode_index"], chosen).nonzero()[:, 0]
         return part
 
+    def ending_before(self, samples: Tensor) -> "TableDataset":
+        """Return a dataset that shares the memory of this one, whose windows end before some of the samples."""
+        part = copy.copy(self)
+        part._store = self._store.ending_before(self.rows[samples])
+        return part
+
     def __len__(self) -> int:
         return self.num_frames
 

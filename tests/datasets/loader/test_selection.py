@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -160,6 +161,43 @@ def test_images_without_statistics_are_normalised_by_those_of_imagenet(video_dat
     assert meta.stats[FRONT]["mean"].flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
 
 
+@pytest.mark.law
+def test_what_is_left_out_is_in_no_chunk_and_the_last_frame_of_an_intervention_is_one(tmp_path: Path) -> None:
+    root, spans = support.record_light(tmp_path / "set"), {0: [[1, 3, "x"]], 1: [], 3: [[4, 6 + 15 % 7, "x"]]}
+    for path in root.glob("meta/episodes/*/*.parquet"):
+        table = pq.read_table(path)
+        stored = [json.dumps(spans[one]) if one in spans else None for one in table["episode_index"].to_pylist()]
+        pq.write_table(table.append_column("bhd/interventions", pa.array(stored, pa.string())), path)
+    meta = open_metadata(root)
+    place = {one: int(meta.episodes["dataset_from_index"][one]) for one in range(5)}
+    driven = {place[one] + frame for one in (0, 3) for first, end, _ in spans[one] for frame in range(first, end)}
+    recorded = place[2] + 1  # of a recorder that stored no spans
+    weights = frame_weights(meta, None, intervention=3.0)
+    assert weights is not None
+    assert set((weights == 3.0).nonzero()[:, 0].tolist()) == {*driven, recorded}
+    options = {"batch_size": 8, "delta_timestamps": {"action": CHUNK, "observation.state": [-0.1, 0.0]}}
+    plain = make_loader("t/t", LoaderConfig(**options), root=root).dataset
+    for name in ("learner_weight", "intervention_weight"):
+        loader = make_loader("t/t", LoaderConfig(**options, **{name: 0.0}), root=root).train
+        weights = frame_weights(meta, None, **{name.removesuffix("_weight"): 0.0})
+        assert weights is not None
+        kept = set(weights.nonzero()[:, 0].tolist())
+        for batch in loader:
+            for row, index in enumerate(batch["index"].tolist()):
+                whole = plain[index]
+                assert torch.equal(batch["observation.state"][row], whole["observation.state"])
+                end = next(
+                    at for at in range(index, index + len(CHUNK) + 1) if at not in kept or at - index == len(CHUNK)
+                )
+                ours = ~whole["action_is_pad"] & (torch.arange(len(CHUNK)) < end - index)
+                assert torch.equal(~batch["action_is_pad"][row], ours)
+                assert torch.equal(batch["action"][row][ours], whole["action"][ours])
+                assert (batch["action"][row][~ours] == batch["action"][row][int(ours.sum()) - 1]).all()
+    with pytest.raises(ConfigError, match=r"'action' is learned in chunks.* Raise budget_gib"):
+        make_loader("t/t", LoaderConfig(**options, learner_weight=0.0, budget_gib=1e-9), root=root)
+
+
+CHUNK = [0.0, 0.1, 0.2, 0.3]
 KEYS = ["observation.state", "action"]
 
 
