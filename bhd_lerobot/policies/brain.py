@@ -165,7 +165,10 @@ class Brain:
         return np.array(self.uses_images)
 
     def advice(self) -> NDArray[np.float64] | None:
-        """Return what an expert would do in the frame that `act` decided last, shape (n, actions); None without one."""
+        """Return what an expert would do in the frame that `act` decided last, shape (n, actions); None without one.
+
+        NaN where that is what is done.
+        """
         return None
 
     def interventions(self) -> NDArray[np.bool_] | None:

@@ -273,7 +273,8 @@ class EpisodeLoop:
             **frame.columns,
         }
         if (advised := brain.advice()) is not None:
-            values[keys.EXPERT_ACTION] = advised.astype(np.float32)
+            done = np.where(np.isnan(advised), report.requested, advised)
+            values[keys.EXPERT_ACTION] = done.astype(np.float32)
         finished: list[tuple[int, Event]] = []
         for number, frame_report in enumerate((*report.missed, report)):
             if number:  # of the first the brain saw the beginning; the others went by during inference

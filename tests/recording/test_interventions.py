@@ -256,6 +256,8 @@ def test_who_is_no_expert_gives_no_advice(tmp_path: Path) -> None:
     policy = {"brain__type": "learned", "brain__path": tmp_path / "policy", "dataset__expert_action": True}
     with pytest.raises(ConfigError, match=r"brain\.type is 'learned', a policy, and no expert\. Use a rule"):
         run_record(tmp_path / "policy_alone", **policy)
+    with pytest.raises(ConfigError, match=r"brain\.type is 'learned', a policy, and no expert"):
+        run_record(tmp_path / "named", **policy, brain__name="mine")
     run_record(tmp_path / "without", **AVOID, brain__patience_s=1, dataset__num_episodes=1)
     with pytest.raises(DatasetError, match=r"has no column 'expert.action'.*--dataset.expert_action=true"):
         make_loader("t/t", LoaderConfig(batch_size=7, expert_action=True), root=tmp_path / "without")

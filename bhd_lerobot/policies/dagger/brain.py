@@ -84,7 +84,7 @@ class DaggerBrain(Brain):
         self.has_plan = expert.has_plan
         self.uses_images = learner.uses_images or expert.uses_images
         self.uses_privileged_state = learner.uses_privileged_state or expert.uses_privileged_state
-        self._advised: Array | None = None
+        self._advised: Array = np.zeros((0, 0))
         self._watches: list[Watch] = []
         self._collision: Watch | None = None
         self._hold: int | None = None
@@ -122,6 +122,7 @@ class DaggerBrain(Brain):
         if len(self._driving) != n:
             self._driving, self._shown = np.zeros((2, n), np.bool_)
             self._driven, self._causes = np.zeros(n, np.int64), [""] * n
+            self._advised = np.full((n, self._width), np.nan)
         self._driving[ids] = self._shown[ids] = False
         self._driven[ids] = 0
         for sim in ids.tolist():
@@ -142,7 +143,7 @@ class DaggerBrain(Brain):
         self._shown = self._driving & running
         return np.where(self._driving[:, None], advised, wanted)
 
-    def advice(self) -> Array | None:
+    def advice(self) -> Array:
         """Return what the expert would do in the frame that `act` decided last, shape (n, actions), whatever drives."""
         return self._advised
 

@@ -82,8 +82,9 @@ class TakeoverBrain(Brain):
         return self._brain.plan(sim)
 
     def advice(self) -> NDArray[np.float64] | None:
-        """Return what the brain's expert would do."""
-        return self._brain.advice()
+        """Return what the brain's expert would do; NaN while a person drives, who is the expert then."""
+        advised = self._brain.advice()
+        return np.full_like(advised, np.nan) if advised is not None and self._was_taken else advised
 
     def interventions(self) -> NDArray[np.bool_]:
         """Return whether the person drove in the frame that `act` decided last, shape (1,)."""

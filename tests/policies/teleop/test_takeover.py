@@ -78,6 +78,29 @@ def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afres
     assert person.closed
 
 
+@pytest.mark.law
+def test_what_a_person_does_is_what_the_expert_would_do(tmp_path: Path) -> None:
+    class Advised(Counting):
+        def advice(self) -> Any:
+            return np.full((1, len(JOINTS)), 10.0 * self._count)
+
+        def act(self, observation: Observation) -> Any:
+            return np.repeat(super().act(observation), len(JOINTS), axis=1)
+
+    brain, person, frames = Advised("policy", 0.0), Advised("teleop", 1.0), iter(range(99))
+    both: Any = TakeoverBrain(brain, person, lambda: 2 <= next(frames) < 5)  # type: ignore[arg-type]
+    robot = MockArm(MockArmConfig(id="arm", calibration_dir=tmp_path))
+    robot.connect()
+    with closing(LeRobotHost(robot, 50, GateConfig())) as host:
+        loop = EpisodeLoop(host, make_task(FreeConfig(duration_s=0.16), 1, 50, None), both)
+        (episode,) = loop.run([EpisodeSpec(0, 0)])
+    action, expert = episode.columns[keys.ACTION], episode.columns[keys.EXPERT_ACTION]
+    taken = (episode.columns[keys.EVENT] == Event.INTERVENTION).tolist()
+    assert taken[:5] == [False, False, True, True, True]
+    assert np.array_equal(expert[taken], action[taken])
+    assert expert[:2, 0].tolist() == [10.0, 20.0]
+
+
 def test_nobody_takes_over_from_goals() -> None:
     with pytest.raises(ConfigError, match="gives goals"):
         TakeoverBrain(ReachBrain(ReachBrainConfig()), Counting("teleop", 0.0), lambda: False)  # type: ignore[arg-type]
