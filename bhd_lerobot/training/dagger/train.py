@@ -219,8 +219,8 @@ class _Rounds:
         }
         if number:
             own["brain.learner.path"] = self._policy(number - 1)
-        elif self._stages.has_advice:
-            own["dataset.expert_action"] = "true"
+        else:  # as in those of the other rounds, which it is merged with
+            own["dataset.expert_action"] = str(self._stages.has_advice).lower()
         self._call(number, "bhd-record", command(stage, own))
 
     def _train(self, number: int, folder: Path) -> None:

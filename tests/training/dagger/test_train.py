@@ -294,6 +294,11 @@ def test_where_it_is_not_recorded_what_the_expert_would_do_only_what_it_did_is_l
     for number in (0, 1):
         with pytest.raises(dagger._StoppedError):
             rounds._train(number, tmp_path)
+    # What is recorded in all rounds is merged.
+    assert not Path(tmp_path / "data").exists()
+    with pytest.raises(dagger._StoppedError):
+        rounds._record(0, tmp_path)
+    assert "--dataset.expert_action=false" in called.pop()
     # What was recorded before may hold a learner's mistakes as well.
     rounds._config.data = ["before"]
     with pytest.raises(dagger._StoppedError):
