@@ -61,7 +61,7 @@ class BlankedBrain(Brain):
     def __init__(self, config: BlankedConfig, brain: Brain) -> None:
         super().__init__(config)
         self._brain = brain
-        self.has_plan, self.uses_images = brain.has_plan, brain.uses_images
+        self.has_plan, self.uses_images, self.attempts = brain.has_plan, brain.uses_images, brain.attempts
         self.uses_privileged_state = brain.uses_privileged_state
         self._instructions: list[str] = []
 
@@ -83,7 +83,8 @@ class BlankedBrain(Brain):
     def _other_instructions(self, ids: NDArray[np.intp], n: int, instructions: Sequence[str]) -> list[str]:
         if not self.config.exchange:
             return [""] * len(instructions)
-        self._instructions = self._instructions or [""] * n
+        if len(self._instructions) != n:
+            self._instructions = [""] * n
         for sim, instruction in zip(ids, instructions, strict=True):
             self._instructions[sim] = instruction
         return [self._instructions[(sim + 1) % n] for sim in ids]

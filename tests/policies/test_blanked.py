@@ -74,6 +74,8 @@ def test_what_is_exchanged_is_that_of_the_next_simulation_and_nobodys_own() -> N
         brain.act(Observation(("a",), state, {"scene": images}, running=np.array(running, np.bool_)))
         assert spy.seen.images["scene"][:, 0, 0, 0].tolist() == seen
     assert images[:, 0, 0, 0].tolist() == [1, 2, 3]
+    brain.reset(np.arange(4), [1, 2, 3, 4], 4, ["a", "b", "c", "d"])
+    assert spy.instructions == ["b", "c", "d", "a"]
     assert brain.parameters()["exchange"]
     with pytest.raises(ConfigError, match=r"there is one simulation.*Set n_envs to 2 or more"):
         brain.reset(np.arange(1), [1], 1, ["a"])

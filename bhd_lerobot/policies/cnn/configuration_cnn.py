@@ -80,6 +80,9 @@ class CnnConfig(MlpConfig):
                 f"policy.range_minimum is {self.range_minimum} and policy.range_maximum is {self.range_maximum}; the "
                 "first must be positive and below the second [m]."
             )
+        for name in ("yaw_harmonics", "sort_objects", "relative_target"):
+            if getattr(self, name):
+                raise ConfigError(f"policy.{name} is {getattr(self, name)}; a bhd_cnn does not do that. Leave it out.")
         if self.scan.is_used:
             raise ConfigError("bhd_cnn does not read a range finder; leave policy.scan out, or train a bhd_mlp.")
 

@@ -157,7 +157,7 @@ class NavigatorBrain(DrivingBrain):
         if self._scan.shape != scan.shape:
             self._scan = np.full(scan.shape, math.nan)
         new = (scan != self._scan).any(axis=1) & awake
-        self._scan = scan
+        self._scan = scan.copy()  # what is seen is not written to
         hit = self._reader.valid(scan) & (scan < self.bound.range_max_m - 1e-3) & new[:, None]
         ranges = np.where(hit, scan, 0.0)
         # A scan is up to a frame old.

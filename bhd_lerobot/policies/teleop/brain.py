@@ -123,8 +123,7 @@ class TeleopBrain(Brain):
                 return None
             self._answered_s = time.monotonic()
             if self._process is not None:
-                images = {name: image[0] for name, image in observation.images.items()}
-                given = self._process(given, {**seen, **images})
+                given = self._process(given, seen)
             action = self._map(given)
         except (ActionError, BrainStoppedError) as error:
             raise BrainStoppedError(str(error).removesuffix(".")) from error

@@ -12,6 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.cnn.configuration_cnn import CnnConfig
 from bhd_lerobot.policies.cnn.modeling_cnn import CnnPolicy
 from bhd_lerobot.policies.cnn.processor_cnn import OBS_RANGES
@@ -72,6 +73,12 @@ def test_neither_scan_nor_speed_nor_the_origin_of_odometry_changes_an_action_but
     assert changed(IMAGE, slice(None), 0.1)
     without = {key: values for key, values in batch(made, samples).items() if key != OBS_RANGES}
     assert torch.equal(policy.predict_action_chunk(without), chunk)
+
+
+@pytest.mark.parametrize("option", [{"yaw_harmonics": 2}, {"sort_objects": True}, {"relative_target": True}])
+def test_options_of_a_perceptron_that_it_does_not_honour_are_refused(option: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"policy.{next(iter(option))} is .* does not do that"):
+        config(**option)
 
 
 def test_directions_are_those_of_the_beams_that_the_camera_shows() -> None:

@@ -119,6 +119,15 @@ def test_it_does_not_drive_into_a_wall_before_the_goal(distance: float) -> None:
     assert see(bound(), goal_at(2.0, 0.0), scan)[0, 0] <= 0
 
 
+def test_what_it_sees_is_not_written_to() -> None:
+    brain = bound(2)
+    state = np.hstack([np.zeros((2, 2)), np.tile(OPEN, (2, 1))])
+    state.flags.writeable = False
+    brain.act(Observation(names_of(360), state, environment_state=np.repeat(goal_at(2.0, 0.0), 2, axis=0)))
+    brain.reset(np.array([1]), [0], 2)
+    assert np.isfinite(state).all()
+
+
 @each_case("bad", [math.nan, math.inf])
 @each_case("column", range(4))
 def test_without_a_goal_it_stands_and_goes_on_with_one(bad: float, column: int) -> None:
