@@ -87,12 +87,13 @@ class TakeoverBrain(Brain):
         return np.full_like(advised, np.nan) if advised is not None and self._was_taken else advised
 
     def interventions(self) -> NDArray[np.bool_]:
-        """Return whether the person drove in the frame that `act` decided last, shape (1,)."""
-        return np.array([self._was_taken])
+        """Return whether the person, or the brain's expert, drove in the frame that `act` decided last, shape (1,)."""
+        by_expert = None if self._was_taken else self._brain.interventions()
+        return np.array([self._was_taken]) if by_expert is None else by_expert
 
     def causes(self) -> Sequence[str]:
         """Return who took over."""
-        return [CAUSE]
+        return [CAUSE] if self._was_taken else self._brain.causes()
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of both."""
