@@ -112,6 +112,8 @@ class LearnedBrain(Brain):
             robot.action_names,
             robot.fps,
             robot.environment_names if has_environment else None,
+            # A robot of another package has several names, of which `check_brain` knows.
+            (robot.robot_type or None) if robot.body else None,
             robot=robot.robot,
             who=who,
         )

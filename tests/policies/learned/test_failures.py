@@ -12,6 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.errors import ActionError, ConfigError
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -200,6 +201,16 @@ def test_the_registry_asks_the_checkpoint_which_robot_it_drives(folder: Path, tm
     replace(PolicyContract.load(folder), robot_type=None).save(folder)
     assert robot_of_brain(config) == ""
     assert action_names_of(config) == ()
+
+
+def test_a_robot_of_another_type_with_the_same_joints_is_refused(folder: Path) -> None:
+    """What is loaded from the Hub is not known when the configuration is read."""
+    brain = LearnedBrain(LearnedBrainConfig(str(folder)))
+    features = RobotFeatures(rig.STATE, rig.ACTIONS, rig.FPS, rig.ENVIRONMENT, body=turtlebot3_burger())
+    brain.bind(replace(features, robot_type="turtlebot3"))
+    with pytest.raises(ConfigError, match=r"trained on the robot 'turtlebot3' and would drive a 'ur5'"):
+        brain.bind(replace(features, robot_type="ur5"))
+    brain.bind(replace(features, robot_type="my_rover", body=None))
 
 
 def test_a_configuration_is_read_before_its_policy_is_trained(tmp_path: Path) -> None:
