@@ -13,7 +13,7 @@ from bhd_lerobot.errors import BhdError
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.data import TrainingData
 from bhd_lerobot.training.log import Row
-from bhd_lerobot.training.step import Learner, NonFiniteLossError, StepResult
+from bhd_lerobot.training.step import Learner, NonFiniteError, StepResult
 
 Batch = dict[str, Any]
 _EARLY = (10, 20, 50, 100)  # steps with a row of metrics although `log_freq` is more: it shows soon that it learns
@@ -125,8 +125,8 @@ class TrainingLoop:
             loaded = time.perf_counter()
             try:
                 result = self.learner.step(batch)
-            except NonFiniteLossError as error:
-                raise self._diverged(self.step + 1, error.args[0], where) from None
+            except NonFiniteError as error:
+                raise self._diverged(self.step + 1, *error.args, where) from None
             self.step += 1
             self._window.results.append(result)
             self._window.batches.append(where)
@@ -182,17 +182,18 @@ class TrainingLoop:
         return row
 
     def _check(self) -> None:
-        """Look for a loss that is not finite; where that was done at once, there is none."""
-        if not self._window.results:
-            return
-        losses = torch.stack([result.loss for result in self._window.results])
-        bad = (~torch.isfinite(losses)).nonzero()
-        if len(bad):
-            place = int(bad[0, 0])
-            first = self.step - len(losses) + 1 + place
-            raise self._diverged(first, float(losses[place]), self._window.batches[place])
+        """Look for a loss or a gradient that is not finite; where that was done at once, there is none."""
+        for what, key in (("loss", "loss"), ("norm of the gradient", "grad_norm")):
+            if not self._window.results or (key == "grad_norm" and self.learner.skips_overflows):
+                continue
+            values = torch.stack([getattr(result, key) for result in self._window.results])
+            bad = (~torch.isfinite(values)).nonzero()
+            if len(bad):
+                place = int(bad[0, 0])
+                first = self.step - len(values) + 1 + place
+                raise self._diverged(first, what, float(values[place]), self._window.batches[place])
 
-    def _diverged(self, step: int, loss: float, where: tuple[Any, Any]) -> DivergedError:
+    def _diverged(self, step: int, what: str, value: float, where: tuple[Any, Any]) -> DivergedError:
         name = f"step {step} (epoch {(step - 1) * self._batch_size // self.data.frames})"
         if all(isinstance(rows, Tensor) for rows in where):
             pairs = [f"{int(e)}:{int(f)}" for e, f in zip(*where, strict=True)]
@@ -200,7 +201,7 @@ class TrainingLoop:
             name += f", batch of episode:frame {shown}"
         saved = "there is none yet" if not self._saved else f"that of step {self._saved} is kept"
         return DivergedError(
-            f"The loss is {loss} at {name}. Training stops; of the checkpoints, {saved}. Lower the learning rate "
+            f"The {what} is {value} at {name}. Training stops; of the checkpoints, {saved}. Lower the learning rate "
             "(--policy.optimizer_lr), clip gradients, or look for extreme values in the data."
         )
 

@@ -22,8 +22,8 @@ class StepResult:
     outputs: Mapping[str, Any]
 
 
-class NonFiniteLossError(ArithmeticError):
-    """The loss is not a number; the weights are as they were before the step."""
+class NonFiniteError(ArithmeticError):
+    """The loss, or the gradient's norm, is not finite: its name and value; the weights are as before the step."""
 
 
 class Learner:
@@ -49,6 +49,8 @@ class Learner:
         self.policy, self.optimizer, self.scheduler = policy, optimizer, scheduler
         self._accelerator, self._preprocessor, self._camera_keys = accelerator, preprocessor, camera_keys
         self._grad_clip_norm = grad_clip_norm
+        self.skips_overflows = accelerator.mixed_precision == "fp16"
+        """Whether a gradient that is not finite is no error: it changes nothing but its own scale."""
         self._checks_at_once = accelerator.device.type == "cpu" and accelerator.num_processes == 1
         self._update_buffers = self.unwrapped.update if has_method(self.unwrapped, "update") else None
         self.policy.train()
@@ -70,13 +72,15 @@ class Learner:
         with nullcontext() if self._is_plain else self._accelerator.autocast():
             loss, outputs = self.policy.forward(batch)
         if self._checks_at_once and not bool(torch.isfinite(loss)):
-            raise NonFiniteLossError(float(loss.detach()))
+            raise NonFiniteError("loss", float(loss.detach()))
         self._accelerator.backward(loss)
         if self._grad_clip_norm > 0:
             clip = torch.nn.utils.clip_grad_norm_ if self._is_plain else self._accelerator.clip_grad_norm_
             norm = clip(self.policy.parameters(), self._grad_clip_norm)
         else:
             norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), float("inf"))
+        if self._checks_at_once and not bool(torch.isfinite(norm)):
+            raise NonFiniteError("norm of the gradient", float(norm))
         self.optimizer.step()
         self.optimizer.zero_grad()
         if self.scheduler is not None:

@@ -19,6 +19,7 @@ from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.loader import make_loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError
 from bhd_lerobot.policies.learned.policy import load_policy
+from bhd_lerobot.policies.mlp.modeling_mlp import MlpPolicy
 from bhd_lerobot.training import output
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.log import MetricsFile
@@ -278,6 +279,22 @@ def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None
     assert parse_train(again).selection.hold_out == "instruction"
     own.unlink()  # a checkpoint of lerobot-train
     assert parse_train(again).selection.hold_out == "instruction"
+
+
+def test_a_gradient_that_is_not_a_number_stops_before_it_reaches_weights_that_are_saved(data, tmp_path, monkeypatch):
+    calls = []
+    forward = MlpPolicy.forward
+
+    def breaks(self: MlpPolicy, batch: dict) -> tuple:
+        loss, outputs = forward(self, batch)
+        calls.append(None)
+        zero = self.net[0].bias[0] * 0  # the slope of a root is infinite there
+        return (loss + zero.sqrt() if len(calls) == 10 else loss), outputs
+
+    monkeypatch.setattr(MlpPolicy, "forward", breaks)
+    with pytest.raises(BhdError, match=r"norm of the gradient is nan at step 10 .*step 5 is kept"):
+        run_train(options(data, tmp_path / "run", MLP, steps=10, save_freq=5))
+    assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000005", "last"]
 
 
 def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(data, tmp_path, monkeypatch):
