@@ -94,6 +94,7 @@ class Run(BaseCallback):
                 config.robot,
                 config.task,
                 seed=config.seed,
+                cameras=False,  # nothing looks through them
                 autoreset_mode="Disabled",
                 threads=config.env.threads,
                 first_episode=first_episode,

@@ -20,6 +20,7 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
 
 from bhd_lerobot.cli.train import main
+from bhd_lerobot.envs.episodes import SteppedEpisodes
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
@@ -286,6 +287,11 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
     ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
 ]
+
+
+def test_nothing_is_rendered_while_nothing_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SteppedEpisodes, "_images", lambda *_: pytest.fail("an image was rendered"))
+    assert run(tmp_path / "run", robot__camera="true", steps=32).step == 32
 
 
 def test_a_robot_and_a_task_without_an_environment_are_refused_by_name() -> None:
