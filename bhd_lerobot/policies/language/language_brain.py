@@ -105,6 +105,7 @@ class LanguageBrain(PickBrain):
         self._home = arm.home[: len(arm.chain.joints)]
         if self.perceiver is not None and robot.cameras is not None:
             self.perceiver.check(robot.cameras)
+            self.perceiver.check_arm(robot.robot_type, arm.workspace)
 
     def needs_images(self, results: Mapping[int, Sequence[CommandResult]]) -> NDArray[np.bool_]:
         """Return in which simulations it is about to look at something, shape (n,)."""

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.tabletop import COLOURS
+from bhd_lerobot.bodies.body import Arm, Workspace
+from bhd_lerobot.bodies.registry import BODIES
+from bhd_lerobot.bodies.tabletop import COLOURS, scene_camera
 from bhd_lerobot.errors import ConfigError, PerceptionError
 from bhd_lerobot.options.declared import Count, Options, Positive, Range
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, recorded_path, weights_digest
@@ -69,7 +71,8 @@ class Perceiver:
         folder = find_checkpoint(options.path)
         self.path = recorded_path(options.path, folder)
         self.who = f"The perception {options.path!r}"
-        self.dataset = dict(PolicyContract.load(folder).dataset or {})
+        contract = PolicyContract.load(folder)
+        self.dataset, self._robot_type = dict(contract.dataset or {}), contract.robot_type
         self._policy = load_perception(folder, options.device)
         self.weights = weights_digest(folder)
         self._device, self._least, self._threads = options.device, options.min_certainty, options.threads
@@ -94,6 +97,18 @@ class Perceiver:
             raise ConfigError(
                 f"{self.who} was trained on images of {width} x {height} px; those of the camera {self.camera!r} are "
                 f"{shape[1]} x {shape[0]}. Set --robot.camera_width={width} --robot.camera_height={height}."
+            )
+
+    def check_arm(self, robot_type: str, workspace: Workspace) -> None:
+        """Check that an arm's table and camera stand where those of the arm do that it was trained before."""
+        trained = self._robot_type or robot_type
+        if trained == robot_type or not robot_type or trained not in BODIES:
+            return
+        there = BODIES[trained]().need(Arm).workspace
+        if (there.table, scene_camera(there)) != (workspace.table, scene_camera(workspace)):
+            raise ConfigError(
+                f"{self.who} was trained on tables of a {trained}, where table and camera stand elsewhere than before a "
+                f"{robot_type}. Train one on recordings of a {robot_type}."
             )
 
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:

@@ -130,13 +130,17 @@ def test_without_a_task_that_tells_anything_the_brain_is_recorded(run: Path, tmp
 
 @each_case(
     ("robot", "message"),
-    [({"robot__camera": None}, "There is: none"), ({"robot__camera_height": 48}, "images of 96 x 72 px; .* 96 x 48")],
+    [
+        ({"robot__camera": None}, "There is: none"),
+        ({"robot__camera_height": 48}, "images of 96 x 72 px; .* 96 x 48"),
+        ({"robot__type": "ur3e"}, "trained on tables of a ur5, where table and camera stand elsewhere than before a ur3e"),
+    ],
 )
 def test_a_recording_that_it_cannot_see_in_makes_no_dataset(run, tmp_path, robot, message):
     root = tmp_path / "episodes"
     brain = {"brain__type": "language", "brain__perception__path": str(run)}
     with pytest.raises(ConfigError, match=message):
-        run_record(root, **ARM, **(CAMERA | robot), **brain, dataset__num_episodes=1)
+        run_record(root, **(ARM | CAMERA | robot), **brain, dataset__num_episodes=1)
     assert not root.exists()
 
 
