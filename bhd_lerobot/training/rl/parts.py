@@ -64,12 +64,12 @@ def make_parts(config: RlConfig, env: BhdVectorEnv, episodes: Sequence[Episode] 
         trainer="bhd-train, ppo",
         versions=versions(),
     )
+    if config.resume:
+        # With the normalisation that the run began with, whatever became of what it started from.
+        return _from_checkpoint(str(config.output_dir), contract)
     if config.start_from is not None:
         steps = (config.policy.n_obs_steps, config.policy.obs_stride) if config.see_history else None
         return _from_checkpoint(config.start_from, contract, see_ignored=config.see_ignored, steps=steps)
-    if config.resume:
-        # With the normalisation that the run began with.
-        return _from_checkpoint(str(config.output_dir), contract)
     mlp = config.policy.actor()
     mlp.input_features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (len(contract.observation_names or ()),))}
     if task.environment_names:

@@ -129,6 +129,14 @@ def test_a_run_that_was_moved_is_resumed_where_it_lies_now(finished: RlResult, t
     assert parse_rl(elsewhere).output_dir == "elsewhere"
 
 
+def test_a_run_is_resumed_whatever_became_of_what_it_started_from(finished: RlResult, tmp_path: Path) -> None:
+    start = shutil.copytree(Path(finished.checkpoint) / "pretrained_model", tmp_path / "start")
+    run(tmp_path / "run", start_from=start, steps=32)
+    shutil.rmtree(start)
+    again = parse_rl([f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64"])
+    assert train(again, Console(file=io.StringIO())).step == 64
+
+
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(finished: RlResult, tmp_path: Path) -> None:
     same = run(tmp_path / "same", validation__rule="{type: gap_follower}")
     assert finished.checkpoint is not None
