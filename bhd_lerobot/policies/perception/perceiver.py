@@ -107,8 +107,8 @@ class Perceiver:
         there = BODIES[trained]().need(Arm).workspace
         if (there.table, scene_camera(there)) != (workspace.table, scene_camera(workspace)):
             raise ConfigError(
-                f"{self.who} was trained on tables of a {trained}, where table and camera stand elsewhere than before a "
-                f"{robot_type}. Train one on recordings of a {robot_type}."
+                f"{self.who} was trained on tables of a {trained}, where table and camera stand elsewhere than before "
+                f"a {robot_type}. Train one on recordings of a {robot_type}."
             )
 
     def look(self, images: Mapping[str, NDArray[np.uint8]], sim: int) -> list[PerceivedObject]:

@@ -133,7 +133,10 @@ def test_without_a_task_that_tells_anything_the_brain_is_recorded(run: Path, tmp
     [
         ({"robot__camera": None}, "There is: none"),
         ({"robot__camera_height": 48}, "images of 96 x 72 px; .* 96 x 48"),
-        ({"robot__type": "ur3e"}, "trained on tables of a ur5, where table and camera stand elsewhere than before a ur3e"),
+        (
+            {"robot__type": "ur3e"},
+            "tables of a ur5, where table and camera stand elsewhere than before a ur3e",
+        ),
     ],
 )
 def test_a_recording_that_it_cannot_see_in_makes_no_dataset(run, tmp_path, robot, message):
