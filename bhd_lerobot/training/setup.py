@@ -1,7 +1,7 @@
 """What a training run is made of, from LeRobot's pieces: accelerator, policy, processors, and their checks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
@@ -19,7 +19,7 @@ from lerobot.utils.constants import ACTION
 from bhd_lerobot.datasets.loader.loader import Batch, Loader
 from bhd_lerobot.errors import BhdError, ConfigError, DatasetError, DatasetMismatchError, brief
 from bhd_lerobot.policies.learned.checkpoint_guard import check_checkpoint
-from bhd_lerobot.policies.learned.contract import PolicyContract, find_checkpoint
+from bhd_lerobot.policies.learned.contract import PolicyContract, camera_name, find_checkpoint
 from bhd_lerobot.policies.learned.policy import check_statistics
 from bhd_lerobot.policies.trained_steps import floored
 from bhd_lerobot.registry import ROBOTS, recorded_robot
@@ -95,10 +95,14 @@ def refuse_unsupported(config: BhdTrainConfig) -> None:
             raise ConfigError(f"{name} is not for bhd-train; use lerobot-train, which reads the same configuration.")
 
 
-def check_contract(path: str, meta: LeRobotDatasetMetadata) -> None:
-    """Check that a dataset is of what a checkpoint was trained on."""
+def check_contract(path: str, policy: PreTrainedConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Check that a dataset is of what a checkpoint was trained on; of the cameras, those that the policy looks at."""
     trained, here = PolicyContract.load(path), PolicyContract.from_dataset(meta)
-    cameras = {name: shape for name, shape in (here.cameras or {}).items() if name in (trained.cameras or {})}
+    looks = {camera_name(key) for key in policy.image_features} & (trained.cameras or {}).keys()
+    trained = replace(
+        trained, cameras={name: shape for name, shape in (trained.cameras or {}).items() if name in looks}
+    )
+    cameras = {name: shape for name, shape in (here.cameras or {}).items() if name in looks}
     units = [one.units or "unknown units" for one in (trained, here)]
     if trained.units is not None and units[0] != units[1]:
         raise DatasetMismatchError(

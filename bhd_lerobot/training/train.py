@@ -77,7 +77,7 @@ def train(config: BhdTrainConfig, console: Console | None = None) -> TrainResult
         meta = open_metadata(config)
     tuned = config.policy.pretrained_path if config.policy and config.fine_tune and not config.resume else None
     if tuned is not None:
-        check_contract(str(tuned), meta)
+        check_contract(str(tuned), config.policy, meta)
     select_episodes(config, meta)
     policy = build_policy(config, meta, accelerator)
     select_parameters(policy, config.fine_tune_parameters)

@@ -110,6 +110,15 @@ def test_fine_tuning_on_what_does_not_fit_is_refused(data: Path, trained: Path, 
     refused(options(data, tmp_path / "run", {}, fine_tune=other), DatasetMismatchError, match)
 
 
+def test_a_camera_that_a_policy_does_not_look_through_need_not_be_the_same(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "first", MLP, steps=1))
+    contract = tmp_path / "first" / "checkpoints" / "last" / "pretrained_model" / "bhd.json"
+    contract.write_text(json.dumps({**json.loads(contract.read_text()), "cameras": {"front": [8, 8, 3]}}))
+    root = make_dataset(tmp_path / "set", episodes=2, frames=4, camera=True)
+    result, _ = run_train(options(root, tmp_path / "run", {}, fine_tune=tmp_path / "first", steps=1))
+    assert result.step == 1
+
+
 def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(data, tmp_path):
     """What it says nothing about stays as it is observed: by `bhd-train` in all ways.
 
