@@ -64,7 +64,8 @@ def resumed_checkpoint(path: Path) -> Path:
 def _refuse_ignored(options: Mapping[str, Any], values: Mapping[str, Any]) -> None:
     """Refuse options that a resumed run does not take: where it started, and what its optimizer's state says."""
     for name, wanted in options.items():
-        is_of_optimizer = name.startswith(("policy.optimizer_", "optimizer.")) and name != "optimizer.grad_clip_norm"
+        theirs = ("policy.optimizer_", "policy.scheduler", "optimizer.")  # the policy's are of its optimizer's making
+        is_of_optimizer = name.startswith(theirs) and name != "optimizer.grad_clip_norm"
         was: Any = values
         for key in name.split("."):
             was = was.get(key) if isinstance(was, Mapping) else None

@@ -226,6 +226,7 @@ def test_what_a_resumed_run_would_ignore_is_refused(data: Path, tmp_path: Path) 
     resume = ["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=7"]
     for name, value, was in (
         ("policy.optimizer_lr", 0.5, 0.001),
+        ("policy.scheduler_warmup_steps", 5, 100),
         ("optimizer.weight_decay", 0.5, 0.0001),
         ("policy.path", "elsewhere", None),
         ("fine_tune", "elsewhere", None),
