@@ -23,7 +23,6 @@ from bhd_lerobot.errors import BhdError, DatasetMismatchError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.metrics import EpisodeMetrics, JerkMeasure, measure
 from bhd_lerobot.policies.brain import is_privileged
-from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.registry import make_brain, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
@@ -57,9 +56,8 @@ class BrainRun:
         return is_privileged(self.loop.brain, self.loop.task.environment_names)
 
     def close(self) -> None:
-        """Disconnect a teleoperator."""
-        if isinstance(self.loop.brain, TeleopBrain):
-            self.loop.brain.close()
+        """Close the brain."""
+        self.loop.brain.close()
 
     def timing(self) -> dict[str, Any]:
         """Return what was measured on the wall clock, as plain values."""

@@ -120,6 +120,10 @@ class BlankedBrain(Brain):
                 other[sims] = images[np.roll(sims, -1)]
         return other
 
+    def close(self) -> None:
+        """Close the brain."""
+        self._brain.close()
+
     def parameters(self) -> dict[str, Any]:
         """Return what is blanked, and the brain's parameters."""
         blanked = {name: getattr(self.config, name) for name in ("instruction", "images", "exchange")}

@@ -182,6 +182,9 @@ class Brain:
         """
         return ()
 
+    def close(self) -> None:
+        """Let go of what it holds, a device for example; may be called twice."""
+
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the brain, as plain values."""
         return {"type": self.name, **asdict(self.config)}

@@ -15,7 +15,7 @@ from bhd_lerobot.teleoperators.config_keyboard import KeyboardConfig
 
 @contextmanager
 def open_driver(config: RecordConfig, marks: Marks) -> Iterator[Any]:
-    """Make what drives; at the end a teleoperator is disconnected.
+    """Make what drives; at the end it is closed.
 
     Args:
         config: of the recording.
@@ -30,8 +30,7 @@ def open_driver(config: RecordConfig, marks: Marks) -> Iterator[Any]:
     try:
         yield brain
     finally:
-        if isinstance(brain, TeleopBrain | TakeoverBrain):
-            brain.close()
+        brain.close()
 
 
 def mark_keys(config: RecordConfig) -> Sequence[MarkKey]:

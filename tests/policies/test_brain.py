@@ -1,11 +1,21 @@
 """Brains find their inputs by name, or say at once what is missing."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig
+from bhd_lerobot.policies.blanked import BlankedConfig
 from bhd_lerobot.policies.brain import find_columns, find_scan
+from bhd_lerobot.policies.dagger.brain import DaggerConfig
+from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
+from bhd_lerobot.recording.driver import open_driver
+from bhd_lerobot.registry import make_brain
+from bhd_lerobot.rollout.marks import Marks
 from tests.cases import each_case
 
 
@@ -42,3 +52,22 @@ def test_beams_go_once_around_counter_clockwise_from_straight_ahead(beams: int) 
 def test_no_scan_or_a_torn_one_is_refused(names: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="'rule' needs a range scan"):
         find_scan(names, "rule")
+
+
+def test_what_drives_a_recording_is_closed_with_all_that_it_is_made_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Any] = []
+
+    def close(brain: NoopBrain) -> None:
+        closed.append(brain)
+
+    monkeypatch.setattr(NoopBrain, "close", close)
+    one = NoopConfig()
+    for config, parts in ((one, 1), (BlankedConfig(one, images=True), 1), (DaggerConfig(one, one), 2)):
+        given: Any = SimpleNamespace(brain=config, teleop=None)
+        with open_driver(given, Marks()):
+            assert not closed
+        assert len(set(map(id, closed))) == parts
+        closed.clear()
+    both: Any = TakeoverBrain(make_brain(one), NoopBrain(), lambda: False)  # type: ignore[arg-type]
+    both.close()
+    assert len(closed) == 2

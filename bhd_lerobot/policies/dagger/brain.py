@@ -164,6 +164,11 @@ class DaggerBrain(Brain):
         """Return the expert's plan for one simulation."""
         return self.expert.plan(sim)
 
+    def close(self) -> None:
+        """Close learner and expert."""
+        self.learner.close()
+        self.expert.close()
+
     def parameters(self) -> dict[str, Any]:
         """Return the parameters, with those of learner and expert: which weights, for example."""
         own = {field.name: getattr(self.config, field.name) for field in fields(self.config)}

@@ -100,5 +100,6 @@ class TakeoverBrain(Brain):
         return {**self._brain.parameters(), "takeover": self._person.parameters()}
 
     def close(self) -> None:
-        """Disconnect the teleoperator."""
+        """Disconnect the teleoperator, and close the brain."""
         self._person.close()
+        self._brain.close()
