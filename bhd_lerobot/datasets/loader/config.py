@@ -22,9 +22,10 @@ class LoaderConfig(Options):
         seed: decides the order, with the number of the epoch; for the same seed it is that of `lerobot-train`.
         episodes: indices of the episodes to choose from; None means all.
         selection: which of these episodes; None means all.
-        intervention_weight: how often frames with an intervention are drawn, compared with others; 0 drops them.
+        intervention_weight: how often frames with an intervention are drawn, compared with others; 0 drops them, and
+            windows that look ahead end before them, as at an episode's end.
         learner_weight: how often frames are drawn in which nobody intervened though someone could have: those that a
-            learner drove; 0 drops them.
+            learner drove; 0 drops them likewise.
             Held-out samples are not weighted.
         expert_action: serve what the expert would have done, `expert.action`, as `action`.
         eval_split: share of the episodes that is held out, from 0 to below 1.
