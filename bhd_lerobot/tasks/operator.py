@@ -2,13 +2,11 @@
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from bhd_lerobot.tasks.task import Event, Outcome, Task
+from bhd_lerobot.tasks.free import FreeTask
+from bhd_lerobot.tasks.task import Task
 
 
-class OperatorTask(Task):
+class OperatorTask(FreeTask):
     """A task in front of a real robot that does not measure what the task is judged by.
 
     An episode ends when a person states how (`bhd_lerobot.rollout.marks`), or when its time is over. The brain is told
@@ -19,8 +17,6 @@ class OperatorTask(Task):
         n: number of robots.
         fps: frames a second [Hz].
     """
-
-    judged_by: frozenset[str] | None = frozenset()
 
     def __init__(self, task: Task, n: int, fps: int) -> None:
         super().__init__(task, n, fps)
@@ -33,19 +29,6 @@ class OperatorTask(Task):
     def instruction(self, scene: Any) -> str:
         """Return what a person would ask for in this scene."""
         return self._task.instruction(scene)
-
-    def judge(self, truth: Any, running: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return no reward, and a time-out when the time is over, each of shape (n,)."""
-        return np.zeros(len(self.frame)), self.count_frame(running)
-
-    def outcome(self, sim: int, event: Event) -> Outcome:
-        """Return how an episode ended: as the person said."""
-        success = event == Event.SUCCESS
-        return Outcome(success, event, float(success))
-
-    def privileged_state(self) -> NDArray[np.float64]:
-        """Return what the task itself returns."""
-        return self._task.privileged_state()
 
     def parameters(self) -> dict[str, Any]:
         """Return everything that defines the task, and that a person judges it."""
