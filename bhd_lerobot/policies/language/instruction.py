@@ -81,7 +81,8 @@ def parse(instruction: str) -> Request:
         raise InstructionError(f"{instruction!r} is not understood. {_reason(tokens, parts, language)}")
     kind = _only([t for t in tokens if t.part is Part.NOUN], "thing", instruction)
     colour = _only([t for t in tokens if t.part is Part.COLOUR], "colour", instruction)
-    relation = _only([t for t in tokens if t.part in (Part.WHICH, Part.WHERE)], "place or size", instruction)
+    places = (Part.WHICH, Part.WHERE, Part.ASIDE)
+    relation = _only([t for t in tokens if t.part in places], "place or size", instruction)
     what = Description(None if kind == ANYTHING else kind, colour, Relation(relation) if relation else None)
     return Request(goal, what, language)
 
@@ -146,6 +147,8 @@ def _reason(tokens: list[_Token], parts: str, language: Language) -> str:
         reason = f"It names no thing. Known: {language.listing(KINDS)}."
     elif parts.count(Part.NOUN) > 1:
         reason = f"It names more than one thing: {named[Part.NOUN]}. {example}"
+    elif named[Part.ASIDE]:
+        reason = f"{named[Part.ASIDE]} may be where it stands or where it is to go. Say 'on the …' for where it stands."
     else:
         reason = f"The order of its words is not known. {example}"
     return reason

@@ -32,6 +32,7 @@ class Part(StrEnum):
     COLOUR = "C"
     WHICH = "R"  # a place or a size that stands before the noun
     WHERE = "Q"  # a place that stands after it
+    ASIDE = "q"  # the same, which after some verbs may also be where it is to go
     TABLE = "L"
     FROM = "F"
     OBJECT_FIRST = "B"  # the object comes before the verb
@@ -81,7 +82,8 @@ def _words(entries: dict[tuple[Part, str], str]) -> Words:
 
 _ENGLISH_WORDS = _words(
     {
-        (Part.LIFT, ""): "pick up; pick; lift up; lift; grab; take; grasp; raise",
+        (Part.LIFT, ""): "pick up; pick; lift up; lift; grab; grasp; raise",
+        (Part.TAKE, ""): "take",
         (Part.GIVE, ""): "hand; give",
         (Part.BRING, ""): "hand over; bring; bring over; fetch; get; pass; pass over",
         (Part.ME, ""): "me",
@@ -100,13 +102,14 @@ _ENGLISH_WORDS = _words(
         (Part.WHICH, Relation.BIGGEST): "biggest; bigger; big; largest; larger; large",
         (Part.WHICH, Relation.SMALLEST): "smallest; smaller; small; littlest; little",
         (Part.WHERE, Relation.LEFT): (
-            "on the left; on the left side; on the left-hand side; on the left hand side; to the left; at the left; "
-            "on your left; to your left"
+            "on the left; on the left side; on the left-hand side; on the left hand side; at the left; on your left"
         ),
+        (Part.ASIDE, Relation.LEFT): "to the left; to your left",
         (Part.WHERE, Relation.RIGHT): (
-            "on the right; on the right side; on the right-hand side; on the right hand side; to the right; "
-            "at the right; on your right; to your right"
+            "on the right; on the right side; on the right-hand side; on the right hand side; at the right; "
+            "on your right"
         ),
+        (Part.ASIDE, Relation.RIGHT): "to the right; to your right",
         (Part.WHERE, Relation.NEAREST): "nearest to you; closest to you; nearest to the robot; closest to the robot",
         (Part.WHERE, Relation.FARTHEST): (
             "farthest from you; furthest from you; farthest from the robot; furthest from the robot"
@@ -129,11 +132,11 @@ _ENGLISH_WORDS = _words(
         **{(Part.COLOUR, colour): colour for colour in COLOURS},
     }
 )
-_ENGLISH_OBJECT = "D?[CR]*N[QL]*"
+_ENGLISH_OBJECT, _STANDING = "D?[CR]*N[QL]*", "D?[CR]*N[QqL]*"
 ENGLISH = Language(
     words=_ENGLISH_WORDS,
-    lift=re.compile(f"P*V{_ENGLISH_OBJECT}U?L*P*"),
-    give=re.compile(f"P*(?:[HK]M{_ENGLISH_OBJECT}|[HK]{_ENGLISH_OBJECT}(?:G|WG?)|K{_ENGLISH_OBJECT})L*P*"),
+    lift=re.compile(f"P*(?:V{_STANDING}|T{_ENGLISH_OBJECT})U?L*P*"),
+    give=re.compile(f"P*(?:[HK]M{_STANDING}|[HK]{_STANDING}G|[HK]{_ENGLISH_OBJECT}WG?|K{_ENGLISH_OBJECT})L*P*"),
     names={name: name for name in (*COLOURS, *KINDS, ANYTHING, *Relation)},
     verbs="pick up, lift, grab, take, hand me, give me, bring me",
     example="pick up the red cup",
