@@ -208,7 +208,8 @@ def info_of(root: Path) -> DatasetSummary | None:
 def _check_expert(brain: Any) -> None:
     """Raise if nobody states what an expert would do."""
     about = brain.parameters()
-    if dict(about.get("brain", about)).get("type") == "learned":  # a rule is its own expert
+    inner = about.get("brain")  # of one that is blanked
+    if (inner if isinstance(inner, Mapping) else about).get("type") == "learned":  # a rule is its own expert
         raise ConfigError(
             "dataset.expert_action records an expert's actions, but brain.type is 'learned', a policy, and no "
             "expert. Use a rule, or brain.type=dagger with a rule as its expert, such as gap_follower."

@@ -1,5 +1,6 @@
 """From the command line of `bhd-train` to its configuration: also `policy.path`, and `resume` from a checkpoint."""
 
+import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -63,15 +64,18 @@ def resumed_checkpoint(path: Path) -> Path:
 
 def _refuse_ignored(options: Mapping[str, Any], values: Mapping[str, Any]) -> None:
     """Refuse options that a resumed run does not take: where it started, and what its optimizer's state says."""
-    for name, wanted in options.items():
+    for name, given in options.items():
+        wanted = given
         theirs = ("policy.optimizer_", "policy.scheduler", "optimizer.")  # the policy's are of its optimizer's making
         is_of_optimizer = name.startswith(theirs) and name != "optimizer.grad_clip_norm"
         was: Any = values
         for key in name.split("."):
             was = was.get(key) if isinstance(was, Mapping) else None
+        with contextlib.suppress(TypeError, ValueError):
+            wanted = float(wanted)  # YAML takes 1e-3 for text
         if (is_of_optimizer or name in ("fine_tune", "policy.path")) and wanted != was:
             raise ConfigError(
-                f"{name} is {wanted!r}, and a run that is resumed continues with {was!r}. Leave it out, or start a new "
+                f"{name} is {given!r}, and a run that is resumed continues with {was!r}. Leave it out, or start a new "
                 "run with --fine_tune=CHECKPOINT."
             )
 

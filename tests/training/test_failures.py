@@ -233,7 +233,7 @@ def test_what_a_resumed_run_would_ignore_is_refused(data: Path, tmp_path: Path) 
     ):
         with pytest.raises(ConfigError, match=f"{name} is {value!r}, and a run that is resumed .* {was!r}"):
             run_train([*resume, f"--{name}={value}"])
-    run_train([*resume, "--policy.optimizer_lr=0.001", "--optimizer.grad_clip_norm=2.0"])
+    run_train([*resume, "--policy.optimizer_lr=1e-3", "--optimizer.grad_clip_norm=2.0"])
 
 
 def test_what_is_chosen_by_while_training_is_not_what_is_reported(tmp_path, monkeypatch):
