@@ -126,7 +126,8 @@ class TrainingLoop:
             try:
                 result = self.learner.step(batch)
             except NonFiniteError as error:
-                raise self._diverged(self.step + 1, *error.args, where) from None
+                what, value = error.args
+                raise self._diverged(self.step + 1, what, value, where) from None
             self.step += 1
             self._window.results.append(result)
             self._window.batches.append(where)
