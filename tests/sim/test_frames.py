@@ -10,10 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control import kernels
 from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.errors import SimulationError
+from bhd_lerobot.robots.config_arm import SO101Config
+from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -195,6 +198,56 @@ def test_frames_of_arms_are_the_bits_of_ticks_and_steps_in_turns(
         plain = Reacher(n, threads, options).run()
         assert not calls
     np.testing.assert_array_equal(fast, plain)
+
+
+def wander(config: Any, n: int, alone: pytest.MonkeyPatch | None = None) -> NDArray[np.float64]:
+    """Return what arms observe, write and report that follow setpoints and goals, stop, and go on."""
+    robots, rng, rows = Simulation(config, n), np.random.default_rng(0), []
+    if alone is not None:
+        tick_alone(robots, alone)
+    robots.reset(np.arange(n), [config.start_scene()] * n, list(range(n)))
+    cerebellum, dof = robots.cerebellum, len(robots.body.need(Arm).chain.joints)
+    action, posture = cerebellum.command.copy(), tuple((cerebellum.command[0, :dof] + 0.3).tolist())
+    for frame in range(20):
+        action += rng.uniform(-0.1, 0.1, (2, action.shape[1]))[:n]
+        command: Any = action
+        if frame == 3:
+            command = Goals({sim: (BrainCommand("a", joint_target=posture, gripper=0.01),) for sim in range(n)})
+        elif 3 < frame < 8:
+            command = None
+        elif frame == 12:
+            robots.estop()
+        elif frame == 17:
+            robots.bridge.reset()
+            robots.bridge.activate()
+        report = robots.step(command)
+        flags = np.stack([report.limits, report.watchdog, report.mode], axis=1)
+        rows.append([robots.observe().state, report.applied, cerebellum.written.copy(), flags, robots.physics_state])
+    assert alone is None or robots._frames._is_prepared
+    robots.close()
+    return np.array([np.concatenate(row, axis=1) for row in rows])
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        TurtleBot3ManipulationConfig(beams=90, imu=True, collision_monitor=True, arena="random"),
+        SO101Config(),
+        SO101Config(control_hz=100, fps=10, jerk_limits=False),
+    ],
+    ids=["on a base", "from a file", "seldom"],
+)
+def test_frames_of_arms_on_bases_and_from_files_are_the_bits_of_ticks_and_steps_in_turns(
+    monkeypatch: pytest.MonkeyPatch, config: Any
+) -> None:
+    calls = count_calls(monkeypatch)
+    fast = wander(config, 2)
+    assert calls
+    np.testing.assert_array_equal(wander(config, 1, monkeypatch), fast[:, :1])
+    with kernels.plain_python():
+        calls.clear()
+        np.testing.assert_array_equal(fast, wander(config, 2))
+        assert not calls
 
 
 def test_physics_that_diverges_is_found() -> None:
