@@ -126,8 +126,8 @@ def test_training_finds_the_flagged_frames(tmp_path: Path) -> None:
     meta = LeRobotDatasetMetadata("test/avoid", root=root)
     weights = frame_weights(meta, None, intervention=3.0)
     assert weights is not None
-    # 3 s at 10 Hz: the learner's second, the expert's two, and a last frame that says how it ended.
-    assert weights.tolist() == ([1.0] * 10 + [3.0] * 19 + [1.0]) * 2
+    # 3 s at 10 Hz: the learner's second, and the expert's two, also the last frame, whose event says how it ended.
+    assert weights.tolist() == ([1.0] * 10 + [3.0] * 20) * 2
     weights = frame_weights(meta, [1], learner=0.0)
     assert weights is not None
     assert weights.tolist() == [0.0] * 10 + [1.0] * 20
