@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.ur import ur5
@@ -48,11 +49,11 @@ class PerfectArm(Plant):
 
 class Rig:
     def __init__(self, n: int = 1, active: bool = True, planning: Any = None) -> None:
-        self._start(ARM, PerfectArm(n), ArmController(ARM, n, HZ, FRAME, planning), active)
+        self.start(ARM, PerfectArm(n), ArmController(ARM, n, HZ, FRAME, planning), active)
 
-    def _start(self, body: Body, plant: Any, controller: Any, active: bool, sensors: int = 0) -> None:
-        self.n, self.plant, self.controller = plant.n, plant, controller
-        self.cerebellum = Cerebellum(body, plant, HZ, controller, sensors=sensors)
+    def start(self, body: Body, plant: Any, controller: Any, active: bool, *, hz: int = HZ, **options: Any) -> None:
+        self.n, self.plant, self.controller, self.hz = plant.n, plant, controller, hz
+        self.cerebellum = Cerebellum(body, plant, hz, controller, **options)
         self.now, self.sequence, self.names = 0, 0, 0
         self.rows = [self.cerebellum.command.copy()]
         self.modes: list[list[int]] = []
@@ -60,13 +61,13 @@ class Rig:
             assert self.request(Request.CONFIGURE).accepted.all()
             assert self.request(Request.ACTIVATE).accepted.all()
 
-    def request(self, request: Request) -> SendResult:
-        return self.cerebellum.request(request)
+    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
+        return self.cerebellum.request(request, ids)
 
     def tick(self, ticks: int = 1) -> None:
         for _ in range(ticks):
             self.cerebellum.tick(self.now)
-            self.now += TICK_NS
+            self.now += NANOSECONDS // self.hz
             self.rows.append(self.cerebellum.command.copy())
             self.modes.append(self.cerebellum.mode.tolist())
 
@@ -84,12 +85,14 @@ class Rig:
 
     def send(self, values: np.ndarray, mask: np.ndarray | None = None) -> SendResult:
         self.sequence += 1
-        return self.cerebellum.offer(Setpoint(self.sequence, self.now, np.broadcast_to(values, (self.n, 7))), mask)
+        return self.cerebellum.offer(
+            Setpoint(self.sequence, self.now, np.broadcast_to(values, self.rows[0].shape)), mask
+        )
 
     def stream(self, values: np.ndarray, frames: int) -> None:
         for _ in range(frames):
             assert self.send(values).accepted.all()
-            self.tick(FRAME)
+            self.tick(FRAME * self.hz // HZ)
 
     def go(self, sim: int = 0, **fields: object) -> CommandResult | None:
         self.names += 1

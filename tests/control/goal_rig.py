@@ -96,7 +96,6 @@ class Rig:
         self.hard = np.zeros(n, np.bool_)
         self.disturb: Callable[[Rig], None] | None = None  # changes what is measured
         self._rows, self._stopped = [np.stack(self.reference)], list[NDArray[np.bool_]]()
-        self.taken: list[CommandResult] = []
 
     @property
     def reference(self) -> tuple[Array, Array, Array]:

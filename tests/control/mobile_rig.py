@@ -71,7 +71,7 @@ class Rig(arm_rig.Rig):
         arm = ArmController(BODY, n, HZ, FRAME)
         controller = MobileArmController(arm, BaseController(DRIVE, n, HZ, arm=arm, **drive))
         sensors = 0 if drive.get("gyro") is None else drive["gyro"] + 1
-        self._start(BODY, PerfectMobileArm(n) if plant is None else plant, controller, active, sensors)
+        self.start(BODY, PerfectMobileArm(n) if plant is None else plant, controller, active, sensors=sensors)
 
     def push(self, values: Array, due: int | None = None) -> None:
         """Send what no sender of ours sends."""

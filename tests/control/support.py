@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
-from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.drive import BaseController
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.fifo import CommandFifo, StateRing
-from bhd_lerobot.control.messages import NANOSECONDS, Request, SendResult, Setpoint
+from bhd_lerobot.control.messages import NANOSECONDS, SendResult, Setpoint
 from bhd_lerobot.control.plant import Plant, PlantReading
+from tests.control import arm_rig
 
 HZ = 200
 TICK_NS = NANOSECONDS // HZ
@@ -54,22 +54,12 @@ class PerfectPlant(Plant):
         self.position += self.velocity / HZ
 
 
-class Rig:
+class Rig(arm_rig.Rig):
     def __init__(self, n: int = 1, active: bool = True, takes: str = "actuators", **options: object) -> None:
-        self.plant = PerfectPlant(n, takes)
         controller = BaseController(BODY.drive, n, HZ, takes=takes)
-        self.cerebellum = Cerebellum(BODY, self.plant, HZ, controller, **options)  # type: ignore[arg-type]
-        self.n = n
-        self.now = 0
-        self.sequence = 0
-        if active:
-            assert self.request(Request.CONFIGURE).accepted.all()
-            assert self.request(Request.ACTIVATE).accepted.all()
+        self.start(BODY, PerfectPlant(n, takes), controller, active, hz=HZ, **options)
 
-    def request(self, request: Request, ids: NDArray[np.intp] | None = None) -> SendResult:
-        return self.cerebellum.request(request, ids)
-
-    def send(
+    def send(  # type: ignore[override]
         self,
         speed: float,
         yaw_rate: float = 0.0,
@@ -81,15 +71,6 @@ class Rig:
         self.sequence = self.sequence + 1 if sequence is None else sequence
         values = np.tile([float(speed), float(yaw_rate)], (self.n, 1))
         return self.cerebellum.offer(Setpoint(self.sequence, self.now if due is None else due, values), mask)
-
-    def tick(self, ticks: int = 1) -> None:
-        for _ in range(ticks):
-            self.cerebellum.tick(self.now)
-            self.now += TICK_NS
-
-    @property
-    def mode(self) -> int:
-        return int(self.cerebellum.mode[0])
 
     @property
     def command(self) -> list[float]:
@@ -120,13 +101,16 @@ def push_commands(path: Path, count: int) -> None:
             pass
 
 
+def publish(ring: StateRing, number: int) -> None:
+    state = np.zeros((), STATE)
+    state["number"] = state["copies"] = number
+    ring.publish(state)
+
+
 def publish_states(path: Path, count: int) -> None:
     ring = StateRing(STATE, 2, buffer=shared_block(path))
-    state = np.zeros((), STATE)
     for number in range(1, count + 1):
-        state["number"] = number
-        state["copies"] = number
-        ring.publish(state)
+        publish(ring, number)
 
 
 def set_word(path: Path) -> None:

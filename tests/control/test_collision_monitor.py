@@ -88,10 +88,7 @@ def watched(n: int = 1) -> support.Rig:
     rig = base_rig(n)
     monitors = new_monitors(support.BODY.drive, LIDAR, n, support.HZ, BEAMS)
     controller = BaseController(support.BODY.drive, n, support.HZ, monitors=monitors)
-    cerebellum = support.Cerebellum(support.BODY, rig.plant, support.HZ, controller, sensors=BEAMS)
-    rig.cerebellum = cerebellum
-    for request in (support.Request.CONFIGURE, support.Request.ACTIVATE):
-        assert rig.request(request).accepted.all()
+    rig.start(support.BODY, rig.plant, controller, active=True, hz=support.HZ, sensors=BEAMS)
     return rig
 
 
@@ -137,7 +134,7 @@ def stamped(slack_ns: int = 0) -> support.Rig:
         read(out)
         out.stamp_ns = np.array([origin + rig.now])
 
-    rig.plant.read = read_with_stamps  # type: ignore[method-assign]
+    rig.plant.read = read_with_stamps
     rig.cerebellum.stamp_origin_ns = origin
     if slack_ns:
         rig.cerebellum.readings.accept_until(slack_ns, slack_ns)

@@ -154,12 +154,9 @@ def test_a_queue_between_two_processes_loses_and_reorders_nothing(tmp_path: Path
 def test_the_ring_keeps_the_newest_and_hands_out_copies() -> None:
     ring = StateRing(support.STATE, 4)
     assert ring.latest() is None
-    state = np.zeros((), support.STATE)
     states = []
     for number in range(1, 11):
-        state["number"] = number
-        state["copies"] = number
-        ring.publish(state)
+        support.publish(ring, number)
         assert len(ring) == number
         latest = ring.latest()
         assert latest is not None
@@ -171,12 +168,6 @@ def test_the_ring_keeps_the_newest_and_hands_out_copies() -> None:
 def test_a_reader_that_is_interrupted_by_the_writer_never_sees_half_a_state() -> None:
     """The writer laps the reader in the middle of its copy; the reader notices and reads again."""
     ring = StateRing(support.STATE, 2)
-    state = np.zeros((), support.STATE)
-
-    def publish(number: int) -> None:
-        state["number"] = number
-        state["copies"] = number
-        ring.publish(state)
 
     class Interrupted:
         """Slots whose first copy is made while the writer writes."""
@@ -196,11 +187,11 @@ def test_a_reader_that_is_interrupted_by_the_writer_never_sees_half_a_state() ->
             if self.interruptions < 3:
                 self.interruptions += 1
                 for _ in range(2):
-                    publish(int(state["number"]) + 1)
+                    support.publish(ring, len(ring) + 1)
                 torn[2000:] = 255
             return torn
 
-    publish(1)
+    support.publish(ring, 1)
     ring._rows = Interrupted(ring._rows)
     latest = ring.latest()
     assert latest is not None

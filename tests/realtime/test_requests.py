@@ -156,16 +156,6 @@ def test_garbage_in_a_request_ends_nothing_and_the_next_request_is_answered() ->
     assert pair.results()[-1] == ("a", ResultCode.SUCCEEDED)
 
 
-@pytest.mark.parametrize("ends", [(2**62, 0), (0, 2**62), (-5, 3), (2**62, -(2**62))])
-def test_garbage_over_the_ends_of_a_mailbox_ends_nothing(ends: tuple[int, int]) -> None:
-    pair = Pair()
-    pair.requests._head[0], pair.requests._tail[0] = ends
-    pair.tick(3)
-    assert pair.client.submit(goal("a")) is None
-    pair.rest()
-    assert pair.results() == [("a", ResultCode.SUCCEEDED)]
-
-
 def test_a_full_mailbox_is_waited_for_and_then_named() -> None:
     pair = Pair(capacity=2)
     pair.alive = False

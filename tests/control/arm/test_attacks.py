@@ -12,9 +12,8 @@ from bhd_lerobot.bodies.body import HELD, OBSTACLE, Capsule
 from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.clearance import fill_geometry, new_geometries
 from bhd_lerobot.control.arm.controller import ArmController
-from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
-from bhd_lerobot.control.messages import Mode, Request, Setpoint, Watchdog
+from bhd_lerobot.control.messages import Limit, Mode, Request, Setpoint, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from tests.control.arm_rig import ARM, FRAME, HOME, HZ, LIMITS, SWEEP, PerfectArm, Rig, off, posture
@@ -47,12 +46,7 @@ class FeelingArm(PerfectArm):
 
 class FeelingRig(Rig):
     def __init__(self) -> None:
-        super().__init__(active=False)
-        self.plant: Any = FeelingArm(1)
-        self.controller = ArmController(ARM, 1, HZ, FRAME, max_force=150.0)
-        self.cerebellum = Cerebellum(ARM, self.plant, HZ, controller=self.controller)
-        assert self.request(Request.CONFIGURE).accepted.all()
-        assert self.request(Request.ACTIVATE).accepted.all()
+        self.start(ARM, FeelingArm(1), ArmController(ARM, 1, HZ, FRAME, max_force=150.0), active=True)
 
 
 class Interruption(KeyboardInterrupt):
@@ -171,6 +165,7 @@ def test_after_garbage_in_the_queue_an_arm_follows_nothing_before_it_is_reset(ro
         rig.cerebellum.fifo.push(rig.sequence, rig.now, row[None], ONE)
     rig.tick()
     assert rig.mode == Mode.FAULT
+    assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     rig.tick(100)
     stopped = rig.cerebellum.written.copy()
     rig.send(off(j0=0.3))

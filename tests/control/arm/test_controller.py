@@ -260,20 +260,6 @@ def test_a_reading_that_cannot_be_is_a_fault_and_ends_the_goal(what: float | str
     rig.check()
 
 
-def test_non_finite_queue_entries_stop_the_arm() -> None:
-    rig = Rig(2)
-    rig.stream(off(j0=0.2), 4)
-    values = np.tile(off(j0=0.2), (2, 1))
-    values[0, 3] = np.nan
-    rig.cerebellum.fifo.push(100, rig.now, values, np.ones(2, np.bool_))
-    rig.tick(5)
-    assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
-    assert not rig.cerebellum.take_flags()[0][1] & Limit.NON_FINITE
-    rig.tick(100)
-    assert np.array_equal(rig.rows[-1][0], rig.rows[-2][0])
-    rig.check()
-
-
 def test_it_starts_from_the_posture_that_the_arm_is_in() -> None:
     rig = Rig(active=False)
     rig.plant.position[0] = off(j0=0.4, j3=-0.2, j6=-0.05)

@@ -9,7 +9,6 @@ from bhd_lerobot.control.arm.force_limit import explain_force, feel, forget_forc
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.kernels import as_objects
-from bhd_lerobot.errors import ConfigError
 
 HZ = 500
 ARM = ur5()
@@ -20,9 +19,9 @@ HOME = np.array(ARM.arm.home[:6])
 class Felt:
     """Arms at rest whose tools press with forces [N], base frame, shape (n, 3)."""
 
-    def __init__(self, forces: np.ndarray, postures: np.ndarray = HOME, largest: float = 150.0) -> None:
+    def __init__(self, forces: np.ndarray, postures: np.ndarray = HOME) -> None:
         n = len(forces)
-        self.controller = controller = ArmController(ARM, n, HZ, 20, max_force=largest)
+        self.controller = controller = ArmController(ARM, n, HZ, 20, max_force=150.0)
         position, velocity, effort = (controller.states[name][:, :6] for name in ("position", "velocity", "effort"))
         position[:] = postures
         terms = DYNAMICS.terms(position, velocity)
@@ -79,9 +78,3 @@ def test_a_plant_that_measures_no_efforts_has_no_limit() -> None:
     felt = Felt(np.array([(0.0, 0.0, -500.0)]))
     felt.states["has_effort"] = False
     assert felt.update(100) == -1
-
-
-@pytest.mark.parametrize("largest", [0.0, -1.0, float("nan")])
-def test_a_limit_has_to_be_positive(largest: float) -> None:
-    with pytest.raises(ConfigError, match=r"max_force is .*positive"):
-        Felt(np.zeros((1, 3)), largest=largest)

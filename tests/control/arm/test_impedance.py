@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.arm.impedance import ImpedanceController
-from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
-from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Setpoint
+from bhd_lerobot.control.messages import Limit, Mode, Reason, Request
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
+from tests.control.arm_rig import HZ, Rig
 
 Array = NDArray[np.float64]
 ARM = ur5(actuation="torque")
-HZ = 500
 EFFORT = np.array(ARM.limits.effort[:6])
 HOME = np.array(ARM.arm.home)
 DYNAMICS = ArmDynamics(ARM)
@@ -44,35 +43,13 @@ class StuckPlant(Plant):
         self.written.append(ctrl[0].copy())
 
 
-class StuckRig:
+class StuckRig(Rig):
     def __init__(self, hz: int = HZ) -> None:
-        self.plant, self._hz, self._frame_ticks = StuckPlant(), hz, hz // 25
-        self.controller = ImpedanceController(ARM, 1, hz, self._frame_ticks)
-        self.cerebellum = Cerebellum(ARM, self.plant, hz, controller=self.controller)
-        self.ticks = self.sequence = 0
-        for request in (Request.CONFIGURE, Request.ACTIVATE):
-            assert self.cerebellum.request(request).accepted.all()
+        self.start(ARM, StuckPlant(), ImpedanceController(ARM, 1, hz, hz // 25), active=True, hz=hz)
         self.target = self.controller.command.copy()
 
-    @property
-    def now(self) -> int:
-        return self.ticks * 1_000_000_000 // self._hz
-
-    @property
-    def mode(self) -> Mode:
-        return Mode(int(self.cerebellum.mode[0]))
-
-    def tick(self, count: int = 1) -> None:
-        for _ in range(count):
-            self.cerebellum.tick(self.now)
-            self.ticks += 1
-
-    def send(self, frames: int = 1) -> None:
-        for _ in range(frames):
-            self.sequence += 1
-            sent = self.cerebellum.offer(Setpoint(self.sequence, self.now, self.target))
-            assert sent.reasons.tolist() == [Reason.ACCEPTED]
-            self.tick(self._frame_ticks)
+    def follow(self, frames: int = 1) -> None:
+        self.stream(self.target, frames)
 
 
 def test_the_command_is_the_pose_and_the_opening() -> None:
@@ -93,19 +70,19 @@ def test_a_wrench_needs_setpoints_and_ends_with_them() -> None:
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
     rig.tick(100)
     assert not rig.controller.wrench.any()
-    rig.send(10)
+    rig.follow(10)
     assert rig.controller.wrench[0, 0] == 10
     rig.tick(150)  # no more setpoints
     assert rig.mode == Mode.HOLD
     assert not rig.controller.wrench.any()
-    rig.send(10)
+    rig.follow(10)
     assert not rig.controller.wrench.any()  # it has to be asked for again
 
 
 def test_a_hard_stop_ends_a_wrench_at_once() -> None:
     rig = StuckRig()
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
-    rig.send(10)
+    rig.follow(10)
     assert rig.controller.wrench[0, 0] == 10
     rig.cerebellum.estop.press()
     rig.tick()
@@ -130,8 +107,7 @@ def test_a_wrench_comes_and_goes_gradually() -> None:
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
     values = []
     for _ in range(10):
-        rig.sequence += 1
-        rig.cerebellum.offer(Setpoint(rig.sequence, rig.now, rig.target))
+        rig.send(rig.target)
         for _ in range(20):
             rig.tick()
             values.append(rig.controller.wrench[0, 0])
@@ -148,7 +124,7 @@ def test_motors_are_never_asked_for_more_than_they_have_nor_for_jumps() -> None:
     rig = StuckRig()
     rig.controller.set_compliance(Compliance((5000.0,) * 3 + (300.0,) * 3, max_force=120.0, max_moment=20.0))
     rig.target[0, :3] += 1.0
-    rig.send(40)
+    rig.follow(40)
     torque = np.array(rig.plant.written)[:, :6]
     assert (np.abs(torque) <= EFFORT).all()
     assert (np.abs(np.diff(torque, axis=0)) <= EFFORT / 50 + 1e-9).all()
@@ -159,7 +135,7 @@ def test_motors_are_never_asked_for_more_than_they_have_nor_for_jumps() -> None:
 def test_an_invalid_quaternion_stops_the_arm(value: float) -> None:
     rig = StuckRig()
     rig.target[0, 3:7] = (value, 0, 0, 0)
-    rig.send()
+    rig.follow()
     assert rig.mode == Mode.FAULT
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written).all()
@@ -169,7 +145,7 @@ def test_an_invalid_quaternion_stops_the_arm(value: float) -> None:
 def test_places_beyond_any_reach_are_clipped() -> None:
     rig = StuckRig()
     rig.target[0, 0], rig.target[0, 7] = 1e300, 1.0
-    rig.send(20)
+    rig.follow(20)
     assert rig.cerebellum.take_flags()[0][0] & Limit.POSITION
     assert rig.controller.command[0, 7] == pytest.approx(MAX_OPENING)
     assert np.isfinite(rig.controller.command).all()
@@ -177,8 +153,8 @@ def test_places_beyond_any_reach_are_clipped() -> None:
 
 def test_values_that_are_no_numbers_stop_the_arm() -> None:
     rig = StuckRig()
-    rig.send()
-    rig.cerebellum.offer(Setpoint(rig.sequence + 1, rig.now, rig.target))
+    rig.follow()
+    rig.send(rig.target)
     rig.cerebellum.fifo.queues["values"][:] = np.nan  # another process may write to it
     rig.tick()
     assert rig.mode == Mode.FAULT
@@ -189,7 +165,7 @@ def test_values_that_are_no_numbers_stop_the_arm() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
 def test_a_spoilt_torque_reaches_neither_the_motors_nor_the_estimate_of_contacts(value: float) -> None:
     rig = StuckRig()
-    rig.send(5)
+    rig.follow(5)
     rig.controller.actuators[:] = value
     rig.tick(50)
     assert np.isfinite(rig.plant.written).all()
@@ -202,7 +178,7 @@ def test_the_opening_stops_at_the_ends_of_its_range_at_any_rate(hz: int) -> None
     rig = StuckRig(hz)
     for opening in (0.0, MAX_OPENING, -1.0, 1.0):
         rig.target[0, 7] = opening
-        rig.send(25)
+        rig.follow(25)
         assert rig.mode == Mode.TRACKING
         assert rig.plant.written[-1][6] == pytest.approx(np.clip(opening, 0.0, MAX_OPENING), abs=1e-6)
     opened = np.array(rig.plant.written)[:, 6]
@@ -212,7 +188,7 @@ def test_the_opening_stops_at_the_ends_of_its_range_at_any_rate(hz: int) -> None
 
 def test_a_broken_encoder_is_a_fault_and_does_not_spread() -> None:
     rig = StuckRig()
-    rig.send(5)
+    rig.follow(5)
     rig.plant.position[2] = np.nan
     rig.tick(100)
     assert rig.mode == Mode.FAULT
@@ -225,7 +201,7 @@ def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(ca
     rig = StuckRig()
     measured = rig.cerebellum.state(rig.now).measured
     rig.target[0, 2] += 0.1
-    rig.send(50)  # the plant is stuck: the equilibrium is 0.1 m away from the tool
+    rig.follow(50)  # the plant is stuck: the equilibrium is 0.1 m away from the tool
     commanded = rig.controller.command.copy()
     rig.tick(200)
     assert rig.mode == Mode.HOLD
@@ -246,7 +222,7 @@ def test_a_hard_stop_holds_where_the_tool_is_and_soft_ones_what_was_commanded(ca
 
 def test_a_hard_stop_is_over_when_the_joints_are_still() -> None:
     rig = StuckRig()
-    rig.send(5)
+    rig.follow(5)
     rig.plant.velocity[0] = 0.2
     rig.cerebellum.estop.press()
     rig.tick(5)
@@ -259,7 +235,7 @@ def test_a_hard_stop_is_over_when_the_joints_are_still() -> None:
 def test_a_deactivation_brakes_and_ends_in_safe_off() -> None:
     rig = StuckRig()
     rig.target[0, 2] += 0.1
-    rig.send(5)
+    rig.follow(5)
     assert rig.cerebellum.request(Request.DEACTIVATE).accepted.all()
     rig.tick(300)
     assert rig.mode == Mode.SAFE_OFF
@@ -269,7 +245,7 @@ def test_a_restart_forgets_the_episode_before() -> None:
     rig = StuckRig()
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
     rig.target[0, 2] += 0.1
-    rig.send(10)
+    rig.follow(10)
     rig.cerebellum.restart(np.array([0]))
     assert rig.controller.contact_wrench.tolist() == [[0] * 6]
     rig.tick(50)  # not configured: it stays where it is
@@ -281,9 +257,9 @@ def test_a_restart_forgets_which_limits_were_met() -> None:
     rig = StuckRig()
     met = Limit.VELOCITY | Limit.ACCELERATION
     rig.target[0, 2] += 10.0
-    rig.send()
+    rig.follow()
     assert Limit(int(rig.cerebellum.take_flags()[0][0])) & met == met
-    rig.send()
+    rig.follow()
     rig.cerebellum.restart(np.array([0]))
     assert rig.cerebellum.take_flags()[0].tolist() == [Limit.NONE]
 
@@ -298,9 +274,3 @@ def test_a_position_servo_is_refused() -> None:
 def test_too_few_ticks_for_the_estimate_of_contacts_are_refused() -> None:
     with pytest.raises(ConfigError, match="control_hz is 49"):
         ImpedanceController(ARM, 1, 49, 1)
-
-
-@pytest.mark.parametrize(("frame_ticks", "max_force"), [(0, 150.0), (20, 0.0), (20, -1.0), (20, np.nan)])
-def test_a_frame_without_ticks_and_a_force_that_limits_nothing_are_refused(frame_ticks: int, max_force: float) -> None:
-    with pytest.raises(ConfigError, match="must be above 0"):
-        ImpedanceController(ARM, 1, HZ, frame_ticks, max_force)

@@ -5,17 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.setpoints import follow_setpoint, leave_setpoints, take_setpoint
 from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.messages import Limit
+from tests.control.arm_rig import ARM, FRAME, HOME, HZ, LIMITS, off
 
-LIMITS = ur5().limits
 LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
 SPEED, ACCELERATION = np.array(LIMITS.velocity), np.array(LIMITS.acceleration)
-HOME = np.array(ur5().arm.home)
-HZ, FRAME = 500, 20
 SLACK = 1e-9
 
 
@@ -24,7 +21,7 @@ class Stream:
 
     def __init__(self, n: int = 1, start: np.ndarray = HOME, frame: int = FRAME) -> None:
         self.n, self.frame_ticks = n, frame
-        self.controller = controller = ArmController(ur5(), n, HZ, frame, holds=False, keeps_clear=False)
+        self.controller = controller = ArmController(ARM, n, HZ, frame, holds=False, keeps_clear=False)
         self.position, self.velocity = controller.command, controller.velocity
         self.acceleration, self.limits = controller.acceleration, controller.limits
         self.position[:] = start
@@ -71,13 +68,6 @@ class Stream:
         for _ in range(frames):
             self.set_setpoint(values)
             self.tick(self.frame_ticks)
-
-
-def off(**changes: float) -> np.ndarray:
-    values = HOME.copy()
-    for name, change in changes.items():
-        values[int(name[1:])] += change
-    return values
 
 
 wild = st.lists(
@@ -171,18 +161,6 @@ def test_a_range_s_ends_are_inside() -> None:
     assert stream.limits.tolist() == [Limit.POSITION, Limit.NONE]
 
 
-def test_an_arm_without_setpoints_is_left_alone() -> None:
-    stream = Stream(2)
-    stream.set_setpoint(off(j0=1.0), np.array([True, False]))
-    stream.velocity[1, 2] = 0.1  # another writes it
-    before = stream.position[1].copy()
-    for _ in range(50):
-        stream.run()
-    assert np.array_equal(stream.position[1], before)
-    assert stream.velocity[1, 2] == 0.1
-    assert stream.position[0, 0] > HOME[0]
-
-
 def test_dropped_setpoints_are_not_followed_and_the_next_start_from_the_reference() -> None:
     stream = Stream()
     stream.frame(off(j0=1.0), 5)
@@ -195,17 +173,6 @@ def test_dropped_setpoints_are_not_followed_and_the_next_start_from_the_referenc
     stream.rows.clear()
     stream.frame(off(j0=0.001), 50)
     assert np.abs(stream.history[:, 0, 0] - HOME[0]).max() < 0.0011
-
-
-def test_arms_are_independent() -> None:
-    rng = np.random.default_rng(3)
-    streams = rng.normal(0, 0.2, (20, 3, 7)).cumsum(axis=0) + HOME
-    together, alone = Stream(3), [Stream() for _ in range(3)]
-    for values in streams:
-        together.frame(values)
-        for arm, one in enumerate(alone):
-            one.frame(values[arm])
-    assert np.array_equal(together.history, np.concatenate([one.history for one in alone], axis=1))
 
 
 def test_setpoints_that_come_more_often_than_frames_are_followed_too() -> None:
