@@ -18,7 +18,6 @@ WALL_CLOCK = (
     "apps/monitor/",
     "benchmarks/test_realtime.py",
     "cli/test_ros2.py",
-    "control/test_estop.py",
     "evaluation/test_operator.py",
     "examples/test_network_arm.py",
     "policies/teleop/",

@@ -51,10 +51,7 @@ def sources(tmp_path_factory) -> list[Path]:
     run_record(
         folder / "video_dataset", dataset__episode_time_s=0.5, robot__camera="true", n_envs=1, dataset__num_episodes=2
     )
-    killed = support.create(folder / "killed", video=True)
-    for _ in range(3):
-        support.record(killed, video=True)
-    killed._lock.release()  # as if it had been killed
+    support.killed(folder / "killed", 3, video=True)
     stock = loader_support.record_stock(folder / "stock", cameras=True)
     return [folder / "recorded", folder / "video_dataset", folder / "killed", stock]
 

@@ -1,21 +1,17 @@
 """bhd-data: what it shows, and what it says about what is broken."""
 
 import json
-import os
 import shutil
 import signal
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from tests.cli.test_start import run_unread
 from tests.datasets import foreign, support
 from tests.recording.support import run_record
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -118,16 +114,7 @@ def test_a_corrupted_file_is_named_left_alone_and_repaired(recorded, tmp_path, c
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("arguments", [["info"], ["check", "--json"]])
 def test_a_closed_output_ends_the_command_without_a_message(recorded, arguments):
-    command = [sys.executable, "-m", "bhd_lerobot.cli.data.main", *arguments, str(recorded)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    reading, writing = os.pipe()
-    os.close(reading)
-    try:
-        done = subprocess.run(
-            command, env=environment, stdout=writing, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, check=False
-        )
-    finally:
-        os.close(writing)
+    done = run_unread("-m", "bhd_lerobot.cli.data.main", *arguments, str(recorded))
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
 
 
