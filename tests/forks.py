@@ -7,12 +7,15 @@ program, needs an interpreter of its own.
 
 import multiprocessing
 import os
+import pty
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from tests import shortcuts
+from tests.waiting import until
 
 _CONTEXT = multiprocessing.get_context("forkserver")
 
@@ -68,6 +71,49 @@ class Fork:
         """End it at once, if it still runs, and return its exit status."""
         self._process.kill()
         return self.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+
+class Terminal(Fork):
+    """A function in the foreground of a terminal, and a person at its keys.
+
+    Args:
+        function: of a module; what it returns is the exit status.
+        arguments: what it is called with.
+        log: where its output and its errors go.
+    """
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any, log: Path) -> None:
+        self._person, device = pty.openpty()
+        self._log = log
+        super().__init__(function, *arguments, output=log, terminal=device)
+        os.close(device)
+
+    def text(self) -> str:
+        """Return all that it has printed."""
+        return self._log.read_text(encoding="utf-8")
+
+    def expect(self, pattern: str, times: int = 1) -> None:
+        """Wait until it has printed what fits a pattern, so many times."""
+        until(lambda: len(re.findall(pattern, self.text())) >= times or self.poll() is not None, pattern)
+        assert len(re.findall(pattern, self.text())) >= times, self.text()
+
+    def type(self, keys: bytes) -> None:
+        """Press keys."""
+        os.write(self._person, keys)
+
+    def wait(self) -> int:
+        """Wait until it ends, and close the terminal."""
+        if self._person >= 0:
+            super().wait()
+            os.close(self._person)
+            self._person = -1
+        return super().wait()
 
 
 def _run(

@@ -3,6 +3,7 @@
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -78,25 +79,28 @@ STATE = ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(36)))
 ACTIONS = ("x.vel", "theta.vel")
 
 
+def save_mlp(folder: Path, seed: int, state: int, action: list[float], spread: list[float], **options: Any) -> Path:
+    """Save an untrained policy, as a training saves it, whose actions are some numbers and their spread."""
+    inputs = {"observation.state": PolicyFeature(FeatureType.STATE, (state,))}
+    outputs = {"action": PolicyFeature(FeatureType.ACTION, (len(action),))}
+    chunk = {"hidden_dims": [16], "chunk_size": 4, "n_action_steps": 2}
+    config: Any = MlpConfig(device="cpu", input_features=inputs, output_features=outputs, **chunk, **options)
+    torch.manual_seed(seed)
+    policy = get_policy_class(config.type)(config)
+    stats = {
+        "observation.state": {"mean": np.zeros(state), "std": np.ones(state)},
+        "action": {"mean": np.array(action), "std": np.array(spread)},
+    }
+    for values in stats.values():
+        values |= {"min": values["mean"] - values["std"], "max": values["mean"] + values["std"]}
+    for one in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
+        one.save_pretrained(folder)
+    return folder
+
+
 def save_lidar_policy(folder: Path) -> Path:
     """Save an untrained policy for the robot of these options; return the folder."""
-    config = MlpConfig(
-        device="cpu",
-        hidden_dims=[16],
-        chunk_size=4,
-        n_action_steps=2,
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (len(STATE),))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTIONS),))},
-    )
-    torch.manual_seed(0)
-    sizes = {"observation.state": len(STATE), "action": len(ACTIONS)}
-    stats = {
-        key: {"mean": np.full(n, 0.1), "std": np.full(n, 0.3), "min": np.full(n, -1.0), "max": np.ones(n)}
-        for key, n in sizes.items()
-    }
-    before, after = make_pre_post_processors(config, dataset_stats=stats)
-    for part in (get_policy_class(config.type)(config), before, after):
-        part.save_pretrained(folder)
+    save_mlp(folder, 0, len(STATE), [0.1, 0.1], [0.3, 0.3])
     PolicyContract(
         robot_type="turtlebot3", fps=10, observation_names=STATE, action_names=ACTIONS, environment_names=(), cameras={}
     ).save(folder)

@@ -1,9 +1,7 @@
 """bhd-record on the wall clock: complete datasets, refusals, emergency stops, and what a kill leaves behind."""
 
-import io
 import json
 import os
-import pty
 import re
 import signal
 import time
@@ -14,39 +12,30 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from rich.console import Console
 
 from bhd_lerobot.cli.record import main
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import DatasetMismatchError, RealtimeError
-from bhd_lerobot.options.parse import parse
 from bhd_lerobot.realtime.shared_memory import names, sweep
-from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.recording.record import record
 from bhd_lerobot.recording.report import ESTOP_STATUS, RecordResult
 from bhd_lerobot.tasks.avoid import AvoidTask
 from bhd_lerobot.tasks.task import Event
-from tests.forks import Fork
+from tests.forks import Terminal
 from tests.recording.support import data_columns, options, run_record, saved
 from tests.robots.host.support import is_alive, is_gone, unique
 from tests.waiting import until
 
 LIVE = {"robot__clock": "realtime", "robot__realtime__brain_timeout_s": 20, "robot__realtime__most_misses": 10**6}
+LIVE |= {"dataset__num_episodes": 2, "dataset__episode_time_s": 2}
 SO101 = str(resources.files("bhd_lerobot.bodies").joinpath("so101.xml"))
 ARM = {"robot__type": "ur5", "robot__beams": None, "brain__type": "pick", "task__type": "pick"}
 
 
-def live_options(root: Path, **overrides: object) -> list[str]:
-    return options(root, **{**LIVE, "dataset__num_episodes": 2, "dataset__episode_time_s": 2, **overrides})
-
-
 def run_live(root: Path, **overrides: object) -> tuple[RecordResult, str]:
     """Record on the wall clock, in this process; return the result and what was printed."""
-    console = Console(file=io.StringIO(), width=160)
-    result = record(parse(RecordConfig, live_options(root, **overrides)), console)
-    return result, console.file.getvalue()
+    return run_record(root, **{**LIVE, **overrides})
 
 
 def episodes(root: Path) -> list[dict[str, Any]]:
@@ -134,57 +123,17 @@ def test_a_dataset_of_a_version_that_read_frames_otherwise_is_continued(tmp_path
     assert json.loads(path.read_text())["recording"]["robot"]["realtime"] == then
 
 
-class Program:
-    """bhd-record as a program of its own, with a terminal."""
-
-    def __init__(self, root: Path, name: str, **overrides: object) -> None:
-        self.root, self.name = root, name
-        self.person, device = pty.openpty()
-        self.log = root.parent / "log"
-        self.process = Fork(main, live_options(root, robot__id=name, **overrides), output=self.log, terminal=device)
-        os.close(device)
-
-    def saved(self) -> int:
-        return saved(self.root)
-
-    def wait_for_second_episode(self) -> None:
-        """Wait until one episode is saved and the next is under way."""
-        until(lambda: self.saved() >= 1 or self.process.poll() is not None, "an episode is saved")
-        time.sleep(0.3)
-        assert self.process.poll() is None, self.log.read_text()
-
-    def children(self) -> list[int]:
-        return [
-            int(pid) for pid in Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
-        ]
-
-    def close(self) -> None:
-        self.process.kill()
-        os.close(self.person)
-
-
-@pytest.fixture
-def programs():
-    made: list[Program] = []
-
-    def make(*arguments: Any, **overrides: Any) -> Program:
-        made.append(Program(*arguments, **overrides))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
-
-
 @pytest.mark.thorough
-def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time(tmp_path, programs):
+def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time(tmp_path, request):
     root, name = tmp_path / "d", unique("program")
-    many = {"dataset__num_episodes": 100, "dataset__episode_time_s": 2}
-    stopped = programs(root, name, **many)
-    stopped.wait_for_second_episode()
-    os.write(stopped.person, b" ")
-    assert stopped.process.wait() == ESTOP_STATUS, stopped.log.read_text()
-    text = " ".join(stopped.log.read_text().split())
+    many = options(root, **{**LIVE, "robot__id": name, "dataset__num_episodes": 100})
+    stopped = Terminal(main, many, log=tmp_path / "log")
+    request.addfinalizer(stopped.kill)
+    until(lambda: saved(root) >= 1 or stopped.poll() is not None, "an episode is saved")
+    time.sleep(0.3)
+    stopped.type(b" ")
+    assert stopped.wait() == ESTOP_STATUS, stopped.text()
+    text = " ".join(stopped.text().split())
     assert "space or e, or kill -USR1" in text
     assert "Emergency stop (key)" in text
     assert "--resume=true" in text
@@ -195,26 +144,26 @@ def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time
     assert not (columns["event"][:-1] == Event.ESTOP).any()
     assert not (columns["control.mode"][:-1] == Mode.ESTOP).any()
     assert dataset_info(root).compact
-    before = stopped.saved()
+    before = saved(root)
     assert before >= 2
 
-    killed = programs(root, name, resume="true", **many)
-    until(lambda: killed.saved() > before or killed.process.poll() is not None, "one more is saved")
-    children = killed.children()
-    assert len(children) == 1
+    killed = Terminal(main, [*many, "--resume=true"], log=tmp_path / "log")
+    request.addfinalizer(killed.kill)
+    until(lambda: saved(root) > before or killed.poll() is not None, "one more is saved")
+    (child,) = Path(f"/proc/{killed.pid}/task/{killed.pid}/children").read_text().split()
     assert name in names()
-    killed.process.kill()
-    until(lambda: not any(is_alive(pid) for pid in children), "the robot's processes end by themselves")
+    killed.kill()
+    until(lambda: not is_alive(int(child)), "the robot's process ends by itself")
     sweep()
     assert is_gone(name)
-    saved = killed.saved()
-    assert saved > before
+    there = saved(root)
+    assert there > before
 
-    result, _ = run_live(root, robot__id=name, resume="true", dataset__num_episodes=saved + 1)
-    assert (result.recorded, result.episodes) == (1, saved + 1)
+    result, _ = run_live(root, robot__id=name, resume="true", dataset__num_episodes=there + 1)
+    assert (result.recorded, result.episodes) == (1, there + 1)
     after = {key: np.array(values) for key, values in data_columns(root).items()}
     assert dataset_info(root).compact
-    assert sorted(set(after["episode_index"].tolist())) == list(range(saved + 1))
+    assert sorted(set(after["episode_index"].tolist())) == list(range(there + 1))
     for key in ("action", "observation.state", "event"):
         assert np.array_equal(after[key][: len(columns[key])], columns[key]), key
 
@@ -222,8 +171,6 @@ def test_a_key_stops_the_robot_and_the_run_then_a_kill_and_it_goes_on_every_time
 def test_in_lockstep_a_signal_stops_all_episodes_that_run(tmp_path):
     """As on the wall clock: what was running is saved with its outcome, nothing else is begun."""
     root = tmp_path / "d"
-    console = Console(file=io.StringIO(), width=160)
-    config = parse(RecordConfig, options(root, dataset__num_episodes=20, n_envs=3, dataset__episode_time_s=60))
     begun: list[int] = []
 
     judge = AvoidTask.judge
@@ -236,11 +183,11 @@ def test_in_lockstep_a_signal_stops_all_episodes_that_run(tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(AvoidTask, "judge", judged)
-        result = record(config, console)
+        result, text = run_record(root, dataset__num_episodes=20, n_envs=3, dataset__episode_time_s=60)
     assert result.exit_status == ESTOP_STATUS
     assert result.outcomes["estop"] == 3
     assert result.estop == "signal SIGUSR1"
-    assert re.search(r"Emergency stop \(signal SIGUSR1\)", console.file.getvalue())
+    assert re.search(r"Emergency stop \(signal SIGUSR1\)", text)
     columns = data_columns(root)
     assert columns["event"].count(int(Event.ESTOP)) == 3
     assert len(set(columns["episode_index"])) == result.recorded

@@ -2,12 +2,10 @@
 
 import io
 import os
-import pty
 import re
 import signal
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +20,7 @@ from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.rollout.marks import Marks
 from bhd_lerobot.rollout.progress import ESTOP_STATUS, FAULT_STATUS
-from tests.forks import Fork
+from tests.forks import Terminal
 from tests.recording.support import saved
 from tests.robots.external.mock_devices import MockArm
 from tests.robots.external.test_record import options, run
@@ -84,46 +82,29 @@ def test_the_announced_signal_ends_nothing_after_the_last_episode(tmp_path, monk
     assert (result.recorded, result.exit_status) == (1, 0)
 
 
-class Terminal:
-    """`bhd-record` in a terminal, from which all that it shows is read."""
-
-    def __init__(self, root: Path, **overrides: Any) -> None:
-        self.root, self.log = root, root.parent / "log"
-        self.person, device = pty.openpty()
-        self.process = Fork(main, [PLUGIN, *options(root, **overrides)], output=self.log, terminal=device)
-        os.close(device)
-
-    def text(self) -> str:
-        return self.log.read_text()
-
-    def expect(self, words: str, times: int = 1) -> None:
-        until(lambda: self.text().count(words) >= times or self.process.poll() is not None, words)
-        assert self.text().count(words) >= times, self.text()
+class Slow(Terminal):
+    """A person who gives each phase its time: a key that comes sooner is held."""
 
     def type(self, keys: bytes) -> None:
-        time.sleep(0.8)  # a key that comes sooner is held
-        os.write(self.person, keys)
-
-    def wait(self) -> int:
-        status = self.process.wait()
-        os.close(self.person)
-        return int(status)
+        time.sleep(0.8)
+        super().type(keys)
 
 
 def test_a_recording_by_keys(tmp_path: Path) -> None:
-    at = Terminal(tmp_path / "d", dataset__num_episodes=3, dataset__reset_time_s=600, task__duration_s=600)
+    root, takes = tmp_path / "d", {"dataset__num_episodes": 3, "dataset__reset_time_s": 600, "task__duration_s": 600}
+    at = Slow(main, [PLUGIN, *options(root, **takes)], log=tmp_path / "log")
     at.expect("Keys: ")
-    os.write(at.person, b"s")
+    Terminal.type(at, b"s")
     at.expect("s counts for nothing: the first take has not begun; only the emergency stop counts")
     at.expect("take 1 of 3 · recording")
     at.type(b"s")
     at.expect("take 2 of 3 · reset")
-    until(lambda: saved(at.root) == 1, "it is saved during the reset phase")
+    until(lambda: saved(root) == 1, "it is saved during the reset phase")
     at.type(b"r")
     at.expect("r: the last take is discarded and recorded again")
     at.type(b"\r")
     at.expect("take 1 of 3 · recording", 2)
-    assert saved(at.root) == 0
+    assert saved(root) == 0
     at.type(b"f")
     at.expect("take 2 of 3 · reset", 2)
     at.type(b"p")
@@ -139,9 +120,9 @@ def test_a_recording_by_keys(tmp_path: Path) -> None:
     at.expect("take 3 of 3 · recording")
     at.type(b"s")
     assert at.wait() == 0, at.text()
-    outcomes = [episode.metadata["outcome"] for episode in dataset_info(at.root).episodes]
+    outcomes = [episode.metadata["outcome"] for episode in dataset_info(root).episodes]
     assert outcomes == ["failure", "success", "success"]
-    assert check_dataset(at.root).is_valid
+    assert check_dataset(root).is_valid
     assert "last: failure" in at.text()
     assert "a person drives" in at.text()
     assert "600 s left" in at.text()
