@@ -84,6 +84,15 @@ def resume(root: Path, *, video: bool = False, **options: Any) -> DatasetRecorde
     return DatasetRecorder.resume("t/t", FPS, features, robot_type="toy", root=root, recording={"seed": 1}, **options)
 
 
+def killed(root: Path, episodes: int, *, video: bool = False) -> DatasetRecorder:
+    """Leave a recording as a kill does, after so many episodes; return what is no more its recorder."""
+    recorder = create(root, video=video)
+    for _ in range(episodes):
+        record(recorder, video=video)
+    recorder._lock.release()
+    return recorder
+
+
 def read_back(root: Path) -> int:
     """Compare the data files with what was recorded, without LeRobot, and return the number of episodes."""
     summary = dataset_info(root)

@@ -10,7 +10,7 @@ import pytest
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.push import PushReport, push
 from bhd_lerobot.datasets.storage import layout
-from tests.datasets import support
+from tests.datasets.edit_support import record
 from tests.fake_hub.hub import FakeHub, real_client
 
 EPISODES = 6
@@ -31,9 +31,7 @@ def many_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(layout, "DATA_FILES_SIZE_IN_MB", 0.005)
         patch.setattr(layout, "VIDEO_FILES_SIZE_IN_MB", 0.002)
-        with support.create(root, video=True) as recorder:
-            for _ in range(EPISODES):
-                support.record(recorder, video=True)
+        record(root, list(range(EPISODES)), video=True)
     assert len(list((root / "data").rglob("*.parquet"))) > 1
     return root
 

@@ -208,9 +208,7 @@ def test_a_dataset_that_is_being_recorded_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetLockedError):
         delete(root, [0])
     lock.release()
-    recorder = support.create(tmp_path / "open")
-    support.record(recorder)
-    recorder._lock.release()  # as after a kill
+    support.killed(tmp_path / "open", 1)
     with pytest.raises(DatasetError, match="bhd-data repair"):
         merge([root, tmp_path / "open"], tmp_path / "all")
 

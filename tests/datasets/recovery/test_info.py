@@ -53,10 +53,7 @@ def test_the_advice_works(recorded, other, tmp_path, capsys, break_it):
 
 def test_an_interrupted_recording_of_ours_loses_nothing(other: Path, tmp_path: Path) -> None:
     root = tmp_path / "d"
-    recorder = support.create(root, video=True)
-    for _ in range(3):
-        support.record(recorder, video=True)
-    recorder._lock.release()  # as if it had been killed
+    support.killed(root, 3, video=True)
     torn(root / "meta/info.json")
     report = repair(root, other)
     assert (report.episodes, report.lost) == (3, ())

@@ -99,10 +99,7 @@ def test_episodes_without_rows_are_recovered_and_lost_columns_are_named(recorded
 def test_readable_rows_keep_their_columns(tmp_path: Path) -> None:
     """An interrupted recording has a file for each episode."""
     root = tmp_path / "d"
-    recorder = support.create(root)
-    for _ in range(3):
-        support.record(recorder)
-    recorder._lock.release()  # as if it had been killed
+    support.killed(root, 3)
     cut(20)(root / "meta/episodes/chunk-000/file-001.parquet")
     report = repair(root)
     assert report.episodes == 3
@@ -112,11 +109,7 @@ def test_readable_rows_keep_their_columns(tmp_path: Path) -> None:
 
 def test_an_unfinished_recording_is_still_finished_and_can_be_resumed(tmp_path: Path) -> None:
     root = tmp_path / "d"
-    recorder = support.create(root)
-    for _ in range(2):
-        support.record(recorder)
-    recorder.begin_episode()
-    recorder._lock.release()
+    support.killed(root, 2).begin_episode()
     assert repair(root).aside is None
     assert edits_of(root) == []
     with support.resume(root) as recorder:
@@ -214,9 +207,7 @@ def test_leftovers_of_edits_and_recordings_are_distinguished(recorded: Path, tmp
     keep(recorded, [0], tmp_path / "half")
     shutil.move(tmp_path / "half", edited / ".bhd/compact/new")
     unfinished = tmp_path / "unfinished"
-    recorder = support.create(unfinished)
-    support.record(recorder)
-    recorder._lock.release()
+    support.killed(unfinished, 1)
     (unfinished / ".bhd/compact/new").mkdir(parents=True)
     for root, message in ((edited, "Repeat the edit"), (unfinished, "a recording was interrupted")):
         (found,) = [finding for finding in check_dataset(root).findings if finding.where == ".bhd"]
@@ -250,10 +241,7 @@ def test_a_damaged_value_costs_its_episode_only(recorded: Path, tmp_path: Path) 
 
 def test_pages_that_are_damaged_cost_their_episodes_only(tmp_path: Path) -> None:
     root = tmp_path / "d"
-    recorder = support.create(root)
-    for _ in range(3):
-        support.record(recorder)
-    recorder._lock.release()
+    support.killed(root, 3)
     path = root / "data/chunk-000/file-001.parquet"
     path.write_bytes(path.read_bytes()[:100])
     report = repair(root)

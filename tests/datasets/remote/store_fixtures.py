@@ -9,7 +9,7 @@ import pytest
 
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.store import StoreDataset
-from tests.datasets import support
+from tests.datasets.edit_support import record
 from tests.fake_hub.fixtures import stored as stored_on
 from tests.fake_hub.hub import FakeHub
 
@@ -20,11 +20,7 @@ KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFA
 @pytest.fixture(scope="session")
 def few_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of `EPISODES` episodes in one data and one video file; copy it before it is changed."""
-    root = tmp_path_factory.mktemp("few_files") / "d"
-    with support.create(root, video=True) as recorder:
-        for _ in range(EPISODES):
-            support.record(recorder, video=True)
-    return root
+    return record(tmp_path_factory.mktemp("few_files") / "d", list(range(EPISODES)), video=True)
 
 
 @pytest.fixture(scope="session")

@@ -124,12 +124,8 @@ def _afar_and_here(folder: Path) -> None:
 
 def _killed(folder: Path) -> None:
     """Leave a recording as after a kill: episodes in files of their own, an unfinished one, no statistics."""
-    recorder = support.create(folder / "d 1")
-    for _ in range(3):
-        support.record(recorder)
-    support.fill(recorder.begin_episode(), 3)
+    support.fill(support.killed(folder / "d 1", 3).begin_episode(), 3)
     (folder / "d 1/.bhd/episode-3").mkdir(parents=True)
-    recorder._lock.release()
 
 
 def _edit(*words: str) -> Callable[[Path], list[str]]:

@@ -24,13 +24,7 @@ from bhd_lerobot.errors import (
     DatasetWriteError,
 )
 from tests.datasets import support
-
-
-def make(root: Path, episodes: int = 2, *, video: bool = False) -> Path:
-    with support.create(root, video=video) as recorder:
-        for _ in range(episodes):
-            support.record(recorder, video=video)
-    return root
+from tests.datasets.edit_support import record
 
 
 @contextlib.contextmanager
@@ -202,7 +196,7 @@ def test_a_failed_finalize_gives_the_lock_back_and_can_be_followed_by_more(tmp_p
 
 
 def test_a_dataset_that_does_not_fit_is_not_resumed(tmp_path: Path) -> None:
-    root = make(tmp_path / "d", video=True)
+    root = record(tmp_path / "d", [0, 1], video=True)
     before = support.snapshot(root)
 
     def attempt(**changes: object) -> None:
@@ -228,7 +222,7 @@ def test_a_dataset_that_does_not_fit_is_not_resumed(tmp_path: Path) -> None:
 
 
 def test_a_dataset_of_another_program_is_read_but_not_resumed(tmp_path: Path) -> None:
-    root = make(tmp_path / "d")
+    root = record(tmp_path / "d", [0, 1])
     (root / "meta/bhd.json").unlink()
     (root / "data/chunk-000/file-007.parquet").write_bytes(b"theirs")
     with pytest.raises(DatasetMismatchError, match="not recorded by this program"):
@@ -263,7 +257,7 @@ RECOVERABLE = [one for one in DAMAGES if one[0][:8] in ("meta/epi", "meta/tas") 
 
 
 def test_a_corrupt_file_is_named_and_nothing_is_overwritten(tmp_path: Path) -> None:
-    root = make(tmp_path / "d", video=True)
+    root = record(tmp_path / "d", [0, 1], video=True)
     with support.resume(root, video=True) as recorder:
         support.record(recorder, video=True)
     for name, damage in DAMAGES:
