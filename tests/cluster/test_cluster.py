@@ -30,10 +30,12 @@ from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.rollout.tolerance import TimingTolerance
 from bhd_lerobot.tasks.reach import ReachConfig
 from tests.cluster import fakes
+from tests.datasets.support import snapshot
 from tests.evaluation.test_brains import checkpoint  # noqa: F401  (a fixture)
 from tests.evaluation.test_evaluate import FAILING, run_eval
 from tests.forks import Fork
 from tests.recording.support import options, run_record
+from tests.robots.host.support import is_alive
 from tests.waiting import until
 
 STORE = 100 * 2**20
@@ -108,10 +110,6 @@ def run_alone(root: Path, **overrides: object) -> None:
         run_record(root, **overrides)
 
 
-def files_of(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 def after_saves(monkeypatch, actions) -> None:
     """Do something in this process after some episodes were saved."""
     save, saved = record_module.save_episode, []
@@ -127,14 +125,6 @@ def after_saves(monkeypatch, actions) -> None:
 
 def parent_of(pid: int) -> int:
     return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-
-
-def gone(pid: int) -> bool:
-    """Tell whether a process has ended; one that nobody has waited for counts as ended."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 @pytest.mark.thorough
@@ -168,7 +158,7 @@ def test_a_killed_driver_leaves_good_episodes_and_no_processes(ray_folder, tmp_p
 def working(pid: int) -> bool:
     """Tell whether a process is there and no agent of Ray's."""
     try:
-        return not gone(pid) and b"Agent" not in Path(f"/proc/{pid}/cmdline").read_bytes()
+        return is_alive(pid) and b"Agent" not in Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return False
 
@@ -243,7 +233,7 @@ class TestOnePool:
         assert printed.count("A worker was lost") >= 2
         assert "will be run again" in printed
         run_alone(tmp_path / "local", **many)
-        assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
+        assert snapshot(tmp_path / "ray") == snapshot(tmp_path / "local")
 
     @pytest.mark.thorough
     def test_a_cluster_goes_on_with_what_one_machine_began_images_too(self, cluster, shared, tmp_path):
@@ -253,7 +243,7 @@ class TestOnePool:
         run_alone(tmp_path / "local", **several, resume="true")
         result, _ = run_record(tmp_path / "ray", **several, resume="true", **on(cluster))
         assert result.recorded == 2
-        ours, theirs = files_of(tmp_path / "ray"), files_of(tmp_path / "local")
+        ours, theirs = snapshot(tmp_path / "ray"), snapshot(tmp_path / "local")
         assert ours.keys() == theirs.keys()
         # An encoder's bytes differ now and then on one machine as well; the statistics are those of the very images.
         videos = {name for name in ours if name.endswith(".mp4")}
@@ -317,7 +307,7 @@ class TestOnePool:
         with pytest.raises(ActionError) as spread:
             run_record(tmp_path / "ray", **brain, **on(cluster))
         assert str(spread.value) == str(alone.value)
-        assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
+        assert snapshot(tmp_path / "ray") == snapshot(tmp_path / "local")
 
     def test_ctrl_c_ends_it_in_order_and_one_machine_goes_on(self, cluster, shared, tmp_path, monkeypatch):
         many = {"dataset__num_episodes": 30, "dataset__episode_time_s": 3}
@@ -331,7 +321,7 @@ class TestOnePool:
         assert run_record(tmp_path / "ray", **shorter, resume="true")[0].exit_status == 0
         run_alone(tmp_path / "local", **{**shorter, "dataset__num_episodes": result.recorded})
         run_alone(tmp_path / "local", **shorter, resume="true")
-        assert files_of(tmp_path / "ray") == files_of(tmp_path / "local")
+        assert snapshot(tmp_path / "ray") == snapshot(tmp_path / "local")
 
 
 @pytest.fixture(scope="module")
