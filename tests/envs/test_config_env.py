@@ -69,8 +69,6 @@ def test_all_kinds_of_vector_environments_do_the_same(vector: str) -> None:
         ({"fps": 7}, "fps is 7"),
         ({"fps": 5, "robot": {"fps": 10}}, "env.fps is 5 and env.robot.fps is 10"),
         ({"task_options": {"legs": 2}}, "task.legs"),
-        ({"vector": "parallel"}, "Unknown env.vector 'parallel'"),
-        ({"threads": 0}, "env.threads is 0"),
     ],
 )
 def test_what_cannot_be_honoured_is_named(arguments: dict[str, Any], message: str) -> None:

@@ -95,7 +95,6 @@ def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path
     ("options", "message"),
     [
         (["--dataset.root={}", "--mode=openloop"], "Did you mean 'open_loop'"),
-        (["--dataset.root={}", "--tolerance_m=-1"], "tolerance_m is -1"),
         (["--dataset.root={}", *ROBOT, "--tolerance_m=1"], "tolerance_m and robot are both given"),
         (["--dataset.root={}", *ROBOT, "--gate.max_change=5"], "gate is of robots of other packages"),
         (["--dataset.root={}", "--dataset.episode=9"], "from 0 to 2"),

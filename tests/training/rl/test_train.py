@@ -278,7 +278,6 @@ def test_without_stable_baselines3_the_message_says_how_to_install_it(tmp_path, 
 
 
 WRONG: list[tuple[dict[str, object], str]] = [
-    ({"steps": 0}, "steps is 0; it must be at least 1"),
     ({"seed": 2**32}, "seed is 4294967296; it must be from 0 to 4294967295"),
     ({"reward__events": "{colision: -1}"}, "Did you mean 'collision'"),
     ({"reward__potential": "pose"}, "only a task with a target pose"),
@@ -293,7 +292,6 @@ WRONG: list[tuple[dict[str, object], str]] = [
     ({"resume": "true"}, "resume needs --output_dir"),
     ({"reward.events": "{collision: .inf}"}, "reward.events.collision is inf"),
     ({"policy.activation": "gelul"}, "Did you mean 'gelu'"),
-    ({"policy.n_obs_steps": 0}, "policy.n_obs_steps is 0"),
 ]
 
 
