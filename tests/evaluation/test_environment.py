@@ -12,39 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-import torch
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
 from bhd_lerobot.cli.evaluate import main
-from bhd_lerobot.policies.mlp.configuration_mlp import MlpConfig
 from tests.cases import each_case
 from tests.evaluation.line_env import LineEnv
 from tests.policies.learned.stock_rig import run_stock
+from tests.recording.support import save_mlp as save
 
 EPISODES, BATCH, SEED = 5, 3, 5
 BHD = ["--env.type=bhd", "--env.task=TurtleBot3Avoid-v0", "--env.robot={beams: 12}"]
 BHD += ["--env.task_options={duration_s: 2, min_path_m: 0.3}"]
 LINE = ["--env.discover_packages_path=tests.evaluation.line_env", "--env.type=line"]
-
-
-def save(folder: Path, seed: int, state: int, action: list[float], spread: list[float], **options: Any) -> Path:
-    """Save an untrained policy, as a training saves it, whose actions are some numbers and their spread."""
-    inputs = {"observation.state": PolicyFeature(FeatureType.STATE, (state,))}
-    outputs = {"action": PolicyFeature(FeatureType.ACTION, (len(action),))}
-    chunk = {"hidden_dims": [16], "chunk_size": 4, "n_action_steps": 2}
-    config: Any = MlpConfig(device="cpu", input_features=inputs, output_features=outputs, **chunk, **options)
-    torch.manual_seed(seed)
-    policy = get_policy_class(config.type)(config)
-    stats = {
-        "observation.state": {"mean": np.zeros(state), "std": np.ones(state)},
-        "action": {"mean": np.array(action), "std": np.array(spread)},
-    }
-    for values in stats.values():
-        values |= {"min": values["mean"] - values["std"], "max": values["mean"] + values["std"]}
-    for one in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
-        one.save_pretrained(folder)
-    return folder
 
 
 class Compared(NamedTuple):
@@ -211,9 +189,3 @@ def test_what_cannot_run_is_refused(options, message, tmp_path, capsys):
         assert main([*options, f"--brain.path={path}", f"--output_dir={tmp_path / 'run'}"]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-
-
-def test_results_are_not_overwritten(compared: Compared, capsys: pytest.CaptureFixture[str]) -> None:
-    brain = f"--brain.path={compared.policies['sure']}"
-    assert main([*compared.env, brain, f"--output_dir={compared.folder}"]) == 2
-    assert "holds the results of an evaluation" in capsys.readouterr().err

@@ -1,8 +1,6 @@
 """Real runs: brains in turns, in an order that nothing shows, judged by a person's keys, continued after any end."""
 
 import json
-import os
-import pty
 import re
 import signal
 from pathlib import Path
@@ -13,8 +11,7 @@ import pytest
 from bhd_lerobot.cli.evaluate import main
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.evaluation.operator import drawn_orders
-from tests.forks import Fork
-from tests.waiting import until
+from tests.forks import Fork, Terminal
 
 LABELS = ("quixote", "zeppelin")
 CAMERAS = "{front: {type: mock_camera}}"
@@ -40,44 +37,30 @@ def options(folder: Path, **overrides: object) -> list[str]:
     return [f"--{key}={value}" for key, value in values.items() if value is not None]
 
 
-class Judged:
+class Judged(Terminal):
     """bhd-eval as a program of its own, with a terminal at which a script sits."""
 
     def __init__(self, folder: Path, **overrides: object) -> None:
-        self.person, device = pty.openpty()
-        self.log = folder / "log"
-        self.process = Fork(main, options(folder, **overrides), output=self.log, terminal=device)
-        os.close(device)
-
-    def text(self) -> str:
-        return self.log.read_text(encoding="utf-8")
+        super().__init__(main, options(folder, **overrides), log=folder / "log")
 
     def prompted(self, number: int) -> str:
         """Wait for the prompt before an episode, and return it."""
-        self._wait_for(rf"Episode {number} of \d+, scene .*press Enter")
-        (prompt,) = re.findall(rf"Episode {number} of \d+, scene .*press Enter", self.text())
-        return prompt
+        prompt = rf"Episode {number} of \d+, scene .*press Enter"
+        self.expect(prompt)
+        (found,) = re.findall(prompt, self.text())
+        return str(found)
 
     def begin(self, number: int) -> None:
         """Set up a scene: Enter, and wait until the episode runs."""
         self.prompted(number)
-        os.write(self.person, b"\r")
-        self._wait_for(rf"Episode {number} of \d+ runs")
+        self.type(b"\r")
+        self.expect(rf"Episode {number} of \d+ runs")
 
     def judge(self, keys: str, first: int = 1) -> None:
         """Judge episodes, from a number on, by a key each."""
         for number, key in enumerate(keys, first):
             self.begin(number)
-            os.write(self.person, key.encode())
-
-    def _wait_for(self, pattern: str) -> None:
-        until(lambda: re.search(pattern, self.text()) or self.process.poll() is not None, pattern)
-        assert re.search(pattern, self.text()), self.text()
-
-    def end(self) -> int:
-        status = self.process.wait()
-        os.close(self.person)
-        return status
+            self.type(key.encode())
 
 
 def outcomes(folder: Path) -> dict[str, list[str]]:
@@ -124,7 +107,7 @@ def test_keys_judge_in_a_blinded_order_and_the_report_says_which_brain_it_was(tm
     run = Judged(tmp_path, robot__cameras=CAMERAS)
     keys = "sfffss"
     run.judge(keys)
-    assert run.end() == 0, run.text()
+    assert run.wait() == 0, run.text()
     text = run.text()
     assert "Episode 1 of 6, scene 0 (wave): set up the scene, then press Enter" in text
     before, _, after = text.partition("6/6")
@@ -151,10 +134,10 @@ def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_p
     run.judge(keys[:3])
     run.begin(4)
     if end == "q":
-        os.write(run.person, b"q")
+        run.type(b"q")
     else:
-        run.process.send_signal(end)
-    assert run.end() == {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 128 + signal.SIGTERM, "q": 0}[end]
+        run.send_signal(end)
+    assert run.wait() == {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 128 + signal.SIGTERM, "q": 0}[end]
     if end != signal.SIGKILL:
         text = " ".join(run.text().split())
         assert "The same command runs the missing episodes, and shows the results at the end." in text
@@ -166,7 +149,7 @@ def test_the_same_command_continues_with_what_is_missing_in_the_same_order(tmp_p
     assert run.prompted(4) == prompt
     assert "Episode 3 of" not in run.text()
     run.judge(keys[3:], first=4)
-    assert run.end() == 0, run.text()
+    assert run.wait() == 0, run.text()
     assert outcomes(tmp_path) == expected(tmp_path, keys)
     assert all(check_dataset(tmp_path / "data" / label).is_valid for label in LABELS)
 
@@ -184,8 +167,8 @@ def test_an_emergency_stop_while_a_scene_is_set_up_ends_the_run(tmp_path):
     run = Judged(tmp_path)
     run.judge("s")
     run.prompted(2)
-    os.write(run.person, b" ")
-    assert run.end() == 3
+    run.type(b" ")
+    assert run.wait() == 3
     assert "Emergency stop (key)" in " ".join(run.text().split())
     assert sum(map(len, outcomes(tmp_path).values())) == 1
 
@@ -193,7 +176,7 @@ def test_an_emergency_stop_while_a_scene_is_set_up_ends_the_run(tmp_path):
 def test_a_fault_of_the_robot_ends_the_run_and_what_was_judged_is_kept(tmp_path):
     run = Judged(tmp_path, robot__fault="disconnect", robot__fault_at=40)
     run.begin(1)
-    assert run.end() == 4
+    assert run.wait() == 4
     assert "the bus does not answer" in " ".join(run.text().split())
     assert json.loads((tmp_path / "e" / "results.json").read_text())["partial"] is True
 
@@ -205,7 +188,7 @@ def test_a_sequential_test_ends_a_real_run(tmp_path):
     drawn = orders(tmp_path)
     keys = "".join("s" if label == "zeppelin" else "f" for i in range(8) for label in drawn[str(i)])
     run.judge(keys)
-    assert run.end() == 0, run.text()
+    assert run.wait() == 0, run.text()
     assert "The sequential test ended the run after 8 of 30 pairs of episodes" in " ".join(run.text().split())
     written = json.loads((tmp_path / "e" / "results.json").read_text())
     assert written["partial"] is False
