@@ -145,7 +145,6 @@ def test_emergency_stop_is_latched_until_reset_and_activate(robot):
         ({"lidar_noise_std": math.nan}, "noise_std of the lidar"),
         ({"command_timeout_s": 0}, "does not mean 'off'"),
         ({"camera_width": 0}, "must be positive whole numbers"),
-        ({"seed": -1}, "robot.seed is -1; it must be at least 0"),
     ],
 )
 def test_options_that_cannot_be_honoured(options, message):

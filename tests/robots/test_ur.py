@@ -98,7 +98,6 @@ def test_noise_and_latency_belong_to_the_episode(tmp_path):
         ({"control": "impedance"}, "action_space=tool"),
         ({"scene": "pik"}, "Did you mean 'pick'"),
         ({"stale_after_s": 0}, "robot.stale_after_s is 0; it must be positive and finite"),
-        ({"stale_after_s": math.nan}, "stale_after_s is nan"),
     ],
 )
 def test_options_that_cannot_be_honoured(options, message):

@@ -4,6 +4,7 @@ import io
 import os
 import re
 import signal
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -61,9 +62,7 @@ def resets(robot: SO101) -> bool:
 
 
 def test_it_follows_setpoints_and_goals_and_stops(bus: Bus) -> None:
-    robot = SO101(bus.config(id="table"))
-    robot.connect()
-    try:
+    with SO101(bus.config(id="table")) as robot:
         assert "speeds are the slopes" in " ".join(robot.host.notes)
         seen = robot.get_observation()
         wanted = [*START[:5], (START[5] + 0.1745) * 0.073 / (0.85 + 0.1745)]
@@ -98,8 +97,6 @@ def test_it_follows_setpoints_and_goals_and_stops(bus: Bus) -> None:
         bus.fault.touch()
         until(lambda: mode(robot) == Mode.FAULT, "its silence is a fault")
         assert "no status packet" in robot.host.problem
-    finally:
-        robot.disconnect()
 
 
 def test_reach_is_recorded_with_the_command_of_the_simulation(bus: Bus, tmp_path: Any) -> None:
@@ -123,9 +120,7 @@ def test_reach_is_recorded_with_the_command_of_the_simulation(bus: Bus, tmp_path
 
 @pytest.mark.parametrize("victim", ["device", "cerebellum", "none"])
 def test_its_processes_may_die(bus: Bus, victim: str) -> None:
-    robot = SO101(bus.config(id=f"without_{victim}"))
-    robot.connect()
-    try:
+    with SO101(bus.config(id=f"without_{victim}")) as robot:
         cerebellum = robot.host.link.pid
         [device] = [int(line) for line in children(cerebellum)]
         until(lambda: bus.goals, "it is commanded")
@@ -136,22 +131,17 @@ def test_its_processes_may_die(bus: Bus, victim: str) -> None:
             assert "process of the device ended" in robot.host.problem
         elif victim == "cerebellum":
             os.kill(cerebellum, signal.SIGKILL)
-    finally:
-        robot.disconnect()
     until(lambda: not is_alive(device), "nothing of it is left")
     assert bus.is_on == (victim != "none")  # at an orderly end the device's own options count
 
 
 def test_shares_of_its_range_are_the_same_positions_for_one_program_at_a_time(bus: Bus) -> None:
     options = bus.config(bus.device(use_degrees=False))
-    plant = DevicePlant(SimpleNamespace(**options.plant_values(), rates=options.rates), options.body())
-    reading = PlantReading(1, 6)
-    try:
+    config, reading = SimpleNamespace(**options.plant_values(), rates=options.rates), PlantReading(1, 6)
+    with closing(DevicePlant(config, options.body())) as plant:
         plant.open()
         plant.read(reading)
         assert "is used by process" in refusal(bus.device())
-    finally:
-        plant.close()
     np.testing.assert_allclose(reading.position[0, :5], START[:5], atol=0.1)
     assert not reading.has_effort
 

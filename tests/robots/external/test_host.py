@@ -26,8 +26,10 @@ FPS = 50
 ONLY = np.zeros(1, np.intp)
 
 
-def make(tmp_path: Path, gate: GateConfig | None = None, fps: int = FPS, **options: Any) -> LeRobotHost:
-    robot = MockArm(MockArmConfig(id="test", calibration_dir=tmp_path, log=str(tmp_path / "sent"), **options))
+def make(
+    tmp_path: Path, gate: GateConfig | None = None, fps: int = FPS, kind: type[MockArm] = MockArm, **options: Any
+) -> LeRobotHost:
+    robot = kind(MockArmConfig(id="test", calibration_dir=tmp_path, log=str(tmp_path / "sent"), **options))
     host = LeRobotHost(robot, fps, gate or GateConfig())
     robot.connect()
     return host
@@ -219,6 +221,11 @@ def test_what_cannot_be_recorded_is_refused_before_the_robot_is_touched(tmp_path
 class MockBase(MockArm):
     """A base: its speeds go on until it gets others."""
 
+    def __init__(self, config: MockArmConfig) -> None:
+        super().__init__(config)
+        self.rows: list[tuple[float, float]] = []
+        self.at = 0.0
+
     @property
     def action_features(self) -> dict[str, Any]:
         return {"x.vel": float, "arm.pos": float}
@@ -238,14 +245,9 @@ class MockBase(MockArm):
         return dict(action)
 
 
-def base(
-    tmp_path: Path, gate: GateConfig | None = None, fps: int = FPS, **options: Any
-) -> tuple[LeRobotHost, MockBase]:
-    robot = MockBase(MockArmConfig(id="base", calibration_dir=tmp_path, **options))
-    robot.rows, robot.at = [], 0.0
-    host = LeRobotHost(robot, fps, gate or GateConfig())
-    robot.connect()
-    return host, robot
+def base(*arguments: Any, kind: type[MockBase] = MockBase, **options: Any) -> tuple[LeRobotHost, Any]:
+    host = make(*arguments, kind=kind, **options)
+    return host, host.robot
 
 
 @pytest.mark.parametrize("ending", ["stop", "close", "fault", "estop"])
@@ -308,10 +310,7 @@ MOMENTS = [
 
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_an_emergency_stop_is_one_action_and_what_is_gripped_stays_gripped(tmp_path: Path, moment: str) -> None:
-    robot = SaggingArm(MockArmConfig(id="sag", calibration_dir=tmp_path, log=str(tmp_path / "sent")))
-    host = LeRobotHost(robot, FPS, GateConfig(brain_timeout_s=0.1))
-    robot.connect()
-    with closing(host):
+    with closing(make(tmp_path, GateConfig(brain_timeout_s=0.1), kind=SaggingArm)) as host:
         start(host)
         host.observe()
         host.step(np.array([[20.0, 20.0, 10.0]]))
@@ -357,10 +356,8 @@ def test_an_emergency_stop_whose_call_raises_is_tried_once_more(tmp_path: Path) 
                 raise ConnectionError("There is no status packet!")
             return super().send_action(action)
 
-    robot = Lossy(MockArmConfig(id="lossy", calibration_dir=tmp_path))
-    robot.rows, robot.at = [], 7.0
-    host = LeRobotHost(robot, FPS, GateConfig())
-    robot.connect()
+    host, robot = base(tmp_path, kind=Lossy)
+    robot.at = 7.0
     with closing(host):
         start(host)
         host.step(np.array([[0.2, 9.0]]))
@@ -383,10 +380,7 @@ def test_an_emergency_stop_during_a_long_call_stops_where_the_robot_is_after_it(
                 self.at = 30.0
             return dict(action)
 
-    robot = Blocking(MockArmConfig(id="blocking", calibration_dir=tmp_path))
-    robot.rows, robot.at = [], 0.0
-    host = LeRobotHost(robot, FPS, GateConfig(call_timeout_s=timeout_s))
-    robot.connect()
+    host, robot = base(tmp_path, GateConfig(call_timeout_s=timeout_s), kind=Blocking)
     with closing(host):
         start(host)
         thread = threading.Thread(target=host.step, args=(np.array([[0.2, 50.0]]),))
@@ -497,10 +491,8 @@ def test_a_robot_may_use_the_array_of_an_image_again(tmp_path: Path) -> None:
             self.image[:] = self.observed
             return {**seen, "front": self.image}
 
-    robot = Reusing(MockArmConfig(id="reusing", calibration_dir=tmp_path, cameras={"front": MockCameraConfig()}))
-    robot.connect()
     shown: list[int] = []
-    with closing(LeRobotHost(robot, FPS, GateConfig())) as host:
+    with closing(make(tmp_path, kind=Reusing, cameras={"front": MockCameraConfig()})) as host:
         start(host)
         host.observe()
         frames_pass(host, 4)

@@ -154,7 +154,6 @@ def test_a_teleoperator_that_gives_nan_moves_nothing(tmp_path: Path) -> None:
         ({"map__elbow.pos": "elbow"}, "elbow.*elbow.pos"),
         ({"processor": "nowhere:f"}, "processor is 'nowhere:f', which cannot be imported"),
         ({"gate__range__wrist": "[0, 1]"}, "wrist.*elbow.pos"),
-        ({"dataset__fps": -3}, "dataset.fps is -3"),
         ({"map__elbow.pos": "elbow.pos", "processor": "a:b"}, "leave one of them out"),
         ({"robot__type": "turtlebot3", "robot__cameras": None, "robot__port": None}, "robot.clock=realtime"),
     ],

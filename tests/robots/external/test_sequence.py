@@ -2,12 +2,10 @@
 
 import json
 import os
-import pty
 import re
 import shlex
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,7 @@ from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.tasks.task import Event
 from tests.docs.test_documents import quoted_commands
-from tests.forks import Fork
+from tests.forks import Fork, Terminal
 from tests.recording.support import saved
 from tests.waiting import until
 
@@ -51,27 +49,6 @@ def arguments_of(line: str) -> list[str]:
     return arguments + SMALL * line.startswith("bhd-train")
 
 
-class Terminal:
-    """A command with a person at its keys."""
-
-    def __init__(self, main: Callable[..., int], arguments: list[str], log: Path) -> None:
-        self._person, device = pty.openpty()
-        self.process = Fork(main, arguments, output=log, terminal=device)
-        os.close(device)
-        self._log = log
-
-    def press(self, key: bytes, after: str) -> None:
-        """Press a key once something was printed."""
-        until(lambda: after in self._log.read_text() or self.process.poll() is not None, f"{after!r} is printed")
-        os.write(self._person, key)
-
-    def wait(self) -> int:
-        until(lambda: self.process.poll() is not None, "it has ended")
-        os.close(self._person)
-        assert self.process.poll() is not None
-        return int(self.process.poll() or 0)
-
-
 @pytest.mark.thorough
 def test_the_commands_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -80,20 +57,20 @@ def test_the_commands_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     root = tmp_path / "data" / "cup"
 
     # A kill costs the running episode at most.
-    killed = Terminal(record.main, arguments_of(first), tmp_path / "first.log")
-    until(lambda: saved(root) >= 1 or killed.process.poll() is not None, "an episode is saved")
-    os.kill(killed.process.pid, signal.SIGKILL)
-    killed.wait()
+    killed = Terminal(record.main, arguments_of(first), log=tmp_path / "first.log")
+    until(lambda: saved(root) >= 1 or killed.poll() is not None, "an episode is saved")
+    killed.kill()
     before = saved(root)
 
     # It continues; a take is discarded and recorded again, one is a success.
-    person = Terminal(record.main, arguments_of(resumed), tmp_path / "resumed.log")
-    until(lambda: saved(root) > before or person.process.poll() is not None, "an episode is added")
-    person.press(b"r", "Keys:")
-    until(lambda: saved(root) > before + 1 or person.process.poll() is not None, "another is added")
+    person = Terminal(record.main, arguments_of(resumed), log=tmp_path / "resumed.log")
+    until(lambda: saved(root) > before or person.poll() is not None, "an episode is added")
+    person.expect("Keys:")
+    person.type(b"r")
+    until(lambda: saved(root) > before + 1 or person.poll() is not None, "another is added")
     time.sleep(0.5)
-    person.press(b"s", "Keys:")
-    assert person.wait() == 0, (tmp_path / "resumed.log").read_text()
+    person.type(b"s")
+    assert person.wait() == 0, person.text()
     info = dataset_info(root)
     assert len(info.episodes) == 4
     for episode in info.episodes:
@@ -114,23 +91,25 @@ def test_the_commands_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     # A person takes over from the policy, and gives back.
     longer = [one.replace("duration_s=1", "duration_s=6") for one in arguments_of(corrected)]
-    person = Terminal(record.main, longer, tmp_path / "corrected.log")
-    while person.process.poll() is None:
-        person.press(b"i", "not promised")
+    person = Terminal(record.main, longer, log=tmp_path / "corrected.log")
+    while person.poll() is None:
+        person.expect("not promised")
+        person.type(b"i")
         time.sleep(0.7)
-    assert person.wait() == 0, (tmp_path / "corrected.log").read_text()
+    assert person.wait() == 0, person.text()
     (episode,) = dataset_info(tmp_path / "data" / "cup_corrected").episodes
     assert {span[2] for span in json.loads(episode.metadata["interventions"])} == {"person"}
     events = np.asarray(read_episode(tmp_path / "data" / "cup_corrected", 0)["event"])
     assert (events == Event.INTERVENTION).any()
 
     # Two brains in an order that is not shown: the person judges by keys.
-    person = Terminal(evaluate.main, arguments_of(compared), tmp_path / "compared.log")
+    person = Terminal(evaluate.main, arguments_of(compared), log=tmp_path / "compared.log")
     for number in range(1, 5):
-        person.press(b"\r", f"Episode {number} of 4, scene")
-        person.press(b"s" if number % 2 else b"f", f"Episode {number} of 4 runs")
-    assert person.wait() == 0, (tmp_path / "compared.log").read_text()
-    before_the_end = (tmp_path / "compared.log").read_text().split("Episode 4 of 4 runs")[0]
-    assert not re.search(r"\b(act|hold)\b", before_the_end)
+        person.expect(f"Episode {number} of 4, scene")
+        person.type(b"\r")
+        person.expect(f"Episode {number} of 4 runs")
+        person.type(b"s" if number % 2 else b"f")
+    assert person.wait() == 0, person.text()
+    assert not re.search(r"\b(act|hold)\b", person.text().split("Episode 4 of 4 runs")[0])
     results = json.loads((tmp_path / "outputs" / "eval" / "cup" / "results.json").read_text())
     assert sum(brain["successes"] for brain in results["brains"].values()) == 2

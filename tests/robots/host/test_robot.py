@@ -122,9 +122,7 @@ def test_a_press_of_another_process_while_it_connects_stays_until_a_person_reset
 
     presser = threading.Thread(target=press)
     presser.start()
-    second = turtlebot(name)
-    try:
-        second.connect()
+    with turtlebot(name) as second:
         presser.join()
         expect_stop(second)
         second.restart()  # of the scene, not of the emergency stop
@@ -135,8 +133,6 @@ def test_a_press_of_another_process_while_it_connects_stays_until_a_person_reset
         assert pid != robot.host.link.pid
         drive(second)
         assert mode(robot) in (Mode.HOLD, Mode.TRACKING)
-    finally:
-        second.disconnect()
     assert is_gone(name)
     assert not is_alive(pid)
     with pytest.raises(DeviceNotConnectedError):
@@ -158,12 +154,9 @@ def test_a_press_in_this_process_while_it_connects_is_kept(how):
         return is_starting
 
     starting.add_estop_input(button, "button")
-    try:
-        starting.connect()
+    with starting:
         expect_stop(starting)
         recover(starting)
-    finally:
-        starting.disconnect()
     with pytest.raises(DeviceNotConnectedError):
         starting.estop()
 

@@ -17,10 +17,9 @@ from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.realtime.block import LiveBlock
 from bhd_lerobot.realtime.planning_link import PlanningLink
 from bhd_lerobot.robots.config_ur import UR5Config
-from bhd_lerobot.robots.conformance import check_robot
 from bhd_lerobot.robots.ur import UR5
 from tests.forks import Fork
-from tests.robots.host.support import States, is_gone, mode, relaxed, unique, watchdog_count
+from tests.robots.host.support import States, mode, relaxed, unique, watchdog_count
 from tests.waiting import until
 
 NAME = unique("wire")
@@ -116,15 +115,6 @@ def test_a_goal_is_refused_with_a_reason(arm: tuple[UR5, States]) -> None:
     assert (ended.task_id, ended.success, ended.code) == ("far", False, ResultCode.UNREACHABLE)
 
 
-def test_a_cancelled_goal_ends_as_such_and_the_arm_holds(arm: tuple[UR5, States]) -> None:
-    robot, _ = arm
-    start(robot, goal("cancelled", 1, speed=0.2))
-    assert robot.host.bridge.cancel("cancelled") == ResultCode.SUCCEEDED
-    assert result(robot).code == ResultCode.CANCELLED
-    until(lambda: mode(robot) == Mode.HOLD, "it holds")
-    assert robot.host.bridge.cancel("cancelled") == ResultCode.UNKNOWN_ID
-
-
 def test_an_emergency_stop_ends_the_goal_and_refuses_the_next(arm: tuple[UR5, States]) -> None:
     robot, _ = arm
     start(robot, goal("stopped", 1, speed=0.2))
@@ -144,14 +134,6 @@ def test_an_emergency_stop_ends_the_goal_and_refuses_the_next(arm: tuple[UR5, St
     robot.activate()
     start(robot, goal("after", 1))
     assert result(robot).code == ResultCode.SUCCEEDED
-
-
-def test_an_action_replaces_a_goal(arm: tuple[UR5, States]) -> None:
-    robot, _ = arm
-    start(robot, goal("replaced", 0, speed=0.2))
-    observation = robot.get_observation()
-    robot.send_action({name: observation[name] for name in robot.action_names})
-    assert result(robot).code == ResultCode.REPLACED_BY_SETPOINT
 
 
 def turn(robot: UR5, name: str, by: float) -> None:
@@ -229,12 +211,3 @@ def test_no_press_around_a_reset_is_lost(arm: tuple[UR5, States], tmp_path: Path
         # been reset meanwhile.
         tick = int(np.searchsorted(starts, pressed_ns, "right"))
         assert stopped[tick] or stopped[tick - 1]
-
-
-@pytest.mark.thorough
-def test_it_keeps_lerobots_contract() -> None:
-    def make() -> UR5:
-        return UR5(UR5Config(id=unique("arm-contract"), clock="realtime", realtime=relaxed()))
-
-    assert check_robot(make, adversarial=True) == ()
-    assert is_gone(unique("arm-contract"))
