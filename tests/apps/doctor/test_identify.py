@@ -43,16 +43,13 @@ def test_a_double_with_other_servos_is_found_within_ten_percent() -> None:
 def test_an_arm_on_its_bus_is_found_within_ten_percent(bus: Bus) -> None:
     bus.change(servo={"stiffness": 14.0, "damping": 0.75, "friction": 0.035})
     robot = SO101(for_identification(bus.config(id="identified")))
-    robot.connect()
 
     def found() -> ServoModel | None:
         one = identify(robot.body, next(excite(robot.host)))
         return one if one.error_rad < 0.001 else None  # a machine that stalls delays commands, and fits badly
 
-    try:
+    with robot:
         one = until(found, "it is measured on a machine that keeps up")
-    finally:
-        robot.disconnect()
     assert [one.stiffness, one.damping, one.friction] == pytest.approx([14.0, 0.75, 0.035], rel=0.1)
 
 

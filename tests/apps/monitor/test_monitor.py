@@ -14,6 +14,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -95,16 +96,18 @@ class Robot:
         for word in (Word.BRAIN_ALIVE, Word.CEREBELLUM_ALIVE):
             words[word] = self.now
 
-    def sampler(self) -> tuple[Sampler, LiveBlock]:
-        block = LiveBlock.watch(self.block.name)
-        return Sampler(block, lambda: self.now), block
-
 
 @pytest.fixture
 def robot() -> Iterator[Robot]:
     made = Robot()
     yield made
     made.block.close()
+
+
+@pytest.fixture
+def sampler(robot: Robot) -> Iterator[Sampler]:
+    with closing(LiveBlock.watch(NAME)) as block:
+        yield Sampler(block, lambda: robot.now)
 
 
 @pytest.fixture
@@ -115,7 +118,7 @@ def only(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.law
 def test_who_watches_can_write_nothing_but_the_emergency_stop(robot: Robot) -> None:
-    _, block = robot.sampler()
+    block = LiveBlock.watch(robot.block.name)
     with pytest.raises(ValueError, match="read-only"):
         block.words[0] = 1
     with pytest.raises(ValueError, match="read-only"):
@@ -144,7 +147,7 @@ def test_writing_beside_a_section_is_refused(robot: Robot) -> None:
 
 def test_who_watches_does_not_hold_the_name() -> None:
     robot = Robot(f"{NAME}-held")
-    _, block = robot.sampler()
+    block = LiveBlock.watch(robot.block.name)
     assert block.is_held
     robot.block.close()
     assert not block.is_held
@@ -174,8 +177,7 @@ def test_what_nobody_holds_any_more_is_not_watched() -> None:
     assert not files(name)
 
 
-def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
-    sampler, block = robot.sampler()
+def test_rates_are_those_of_the_last_two_seconds(robot: Robot, sampler: Sampler) -> None:
     first = sampler.sample()
     assert (first.control_rate, first.frame_rate, first.command_rate) == (None, None, None)
     for _ in range(40):
@@ -194,11 +196,9 @@ def test_rates_are_those_of_the_last_two_seconds(robot: Robot) -> None:
     assert shown.control_rate == pytest.approx(100, rel=0.03)
     robot.now += 5 * S
     assert sampler.sample().control_rate == 0  # a loop that hangs
-    block.close()
 
 
-def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot) -> None:
-    sampler, block = robot.sampler()
+def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot, sampler: Sampler) -> None:
     sampler.sample()
     robot.tick(200, limits=[5 * (limit == Limit.VELOCITY) for limit in LIMITS])
     assert sampler.sample().limits["VELOCITY"].per_second == pytest.approx(5)
@@ -212,11 +212,10 @@ def test_rates_begin_anew_with_an_episode_and_need_one(robot: Robot) -> None:
     shown = sampler.sample()
     assert shown.limits["VELOCITY"] == Count(1, pytest.approx(1))
     assert shown.episode == 2
-    block.close()
 
 
 @pytest.mark.law
-def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
+def test_a_state_is_in_seconds_and_names(robot: Robot, sampler: Sampler) -> None:
     words = robot.block.words
     robot.block.fifo.push(1, 0, np.zeros((1, 2)), np.ones(1, np.bool_))
     robot.tick(
@@ -237,7 +236,6 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
     )
     words[Word.CATCH_UP_LOST], words[Word.RECORDER_DROPS] = 5, 6
     robot.now += S // 100
-    sampler, block = robot.sampler()
     shown = sampler.sample()
     assert (shown.id, shown.robot, shown.mode, shown.phase) == (NAME, "turtlebot3", "TRACKING", "RUNNING")
     assert shown.uptime == pytest.approx(102.01)
@@ -257,13 +255,11 @@ def test_a_state_is_in_seconds_and_names(robot: Robot) -> None:
     assert shown.pose == {"x": 1.0, "y": 2.0, "yaw": 3.0}
     assert len(robot.block.fifo) == 1
     json.dumps(shown.as_dict(), allow_nan=False)
-    block.close()
 
 
-def test_under_a_goal_there_is_progress_and_no_setpoint(robot: Robot) -> None:
+def test_under_a_goal_there_is_progress_and_no_setpoint(robot: Robot, sampler: Sampler) -> None:
     write_feedback(robot.state["feedback"], Feedback("2-down", GoalPhase.EXECUTING, 0.25, 1.5, 0.01))
     robot.tick(1, mode=Mode.TRACKING, setpoints_taken=7)
-    sampler, block = robot.sampler()
     shown = sampler.sample()
     assert shown.goal is not None
     assert {
@@ -273,11 +269,9 @@ def test_under_a_goal_there_is_progress_and_no_setpoint(robot: Robot) -> None:
         "remaining_s": 1.5,
     }.items() <= shown.goal.items()
     assert (shown.command_age, shown.dimensions[0].requested) == (None, None)
-    block.close()
 
 
-def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
-    sampler, block = robot.sampler()
+def test_timing_is_that_of_the_ticks(robot: Robot, sampler: Sampler) -> None:
     assert sampler.sample().lateness is None
     for _ in range(99):
         robot.statistics.add(0, 20_000, 320_000)
@@ -287,7 +281,6 @@ def test_timing_is_that_of_the_ticks(robot: Robot) -> None:
     assert takes is not None
     assert (late.p50, late.p99, late.max) == (pytest.approx(20e-6, rel=0.13), pytest.approx(20e-6, rel=0.13), 2e-3)
     assert takes.max == 2e-3
-    block.close()
 
 
 def test_before_anything_is_published_there_is_something_to_show() -> None:
@@ -300,8 +293,7 @@ def test_before_anything_is_published_there_is_something_to_show() -> None:
     made.close()
 
 
-def test_how_a_robot_ended_is_reported(robot: Robot) -> None:
-    sampler, block = robot.sampler()
+def test_how_a_robot_ended_is_reported(robot: Robot, sampler: Sampler) -> None:
     assert sampler.end() is None
     words = robot.block.words
     words[Word.PHASE] = Phase.ENDED
@@ -314,7 +306,6 @@ def test_how_a_robot_ended_is_reported(robot: Robot) -> None:
     assert sampler.end() is None
     robot.block.close()
     assert "killed" in str(sampler.end())
-    block.close()
 
 
 @pytest.mark.usefixtures("only")

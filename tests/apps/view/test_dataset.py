@@ -1,6 +1,7 @@
 """Datasets behind the page that change, are odd, damaged or in use."""
 
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -31,11 +32,8 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
         assert status == 409
         assert "has changed on disk" in content.decode()
         assert len(server.json("/api/dataset")["episodes"]["frames"]) == 3
-        lock = RootLock(root)
-        try:
+        with closing(RootLock(root)):
             status, content = server.mark(0, {"outcome": "success"})
-        finally:
-            lock.release()
         assert status == 409
         assert "being recorded, repaired or edited" in content.decode()
 
@@ -43,12 +41,8 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
 def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None:
     with pytest.raises(DatasetError, match="does not exist"):
         ViewedDataset(tmp_path / "none")
-    lock = RootLock(base)
-    try:
-        with pytest.raises(DatasetLockedError, match="being recorded, repaired or edited"):
-            ViewedDataset(base)
-    finally:
-        lock.release()
+    with closing(RootLock(base)), pytest.raises(DatasetLockedError, match="being recorded, repaired or edited"):
+        ViewedDataset(base)
     root = Path(shutil.copytree(base, tmp_path / "d"))
     path = next((root / "data").rglob("*.parquet"))
     path.unlink()
