@@ -40,10 +40,8 @@ def test_features_are_grouped_by_topic_and_come_back_from_what_is_sent() -> None
     ("path", "text"),
     [
         ("", "A field of nav_msgs/msg/Odometry is missing; it has: header, child_frame_id, pose, twist"),
-        ("twist.twst.linear.x", "Did you mean 'twist'"),
         ("twist.twist.linear", "is geometry_msgs/msg/Vector3; a feature is one number"),
         ("header.frame_id", "is text"),
-        ("pose.covariance", "is array; a feature is one number"),
         ("pose.covariance[3].x", "name an element"),
         ("twist[2]", "is not an array"),
         ("twist..x", "is no name"),
@@ -54,9 +52,7 @@ def test_a_wrong_field_is_named(path: str, text: str) -> None:
         topics_of({"q": FieldConfig("odom", ODOMETRY, path)}, {})
 
 
-def test_a_wrong_type_and_a_topic_of_two_types_are_named() -> None:
-    with pytest.raises(ConfigError, match="Did you mean 'nav_msgs/msg/Odometry'"):
-        topics_of({"q": FieldConfig("odom", "nav_msgs/msg/Odometri", "twist")}, {})
+def test_a_topic_of_two_types_is_named() -> None:
     two = {"a": FEATURES["x.vel"], "b": FieldConfig("odom", "std_msgs/msg/Float64", "data")}
     with pytest.raises(ConfigError, match="mapped with several types"):
         topics_of(two, {})

@@ -2,6 +2,7 @@
 
 import signal
 from collections.abc import Iterator
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,11 +30,8 @@ STOPS = {
 
 @pytest.fixture
 def plant(domain: int) -> Iterator[ArmPlant]:
-    made = ArmPlant(SimpleNamespace(ros2=Ros2Config(domain=domain, silence_s=1.0)), ur5())
-    try:
+    with closing(ArmPlant(SimpleNamespace(ros2=Ros2Config(domain=domain, silence_s=1.0)), ur5())) as made:
         yield made
-    finally:
-        made.close()
 
 
 def reading() -> PlantReading:

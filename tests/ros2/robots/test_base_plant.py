@@ -6,6 +6,7 @@ import re
 import signal
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from types import SimpleNamespace
 from typing import Any
 
@@ -67,13 +68,10 @@ def robot(shared: int) -> Iterator[Peer]:
 
 @pytest.fixture
 def plant(robot: Peer, shared: int) -> Iterator[BasePlant]:
-    made = make(shared)
-    made.open()
-    try:
+    with closing(make(shared)) as made:
+        made.open()
         made.enable()
         yield made
-    finally:
-        made.close()
 
 
 def drive(plant: BasePlant, goes_on: Callable[[], object], what: str) -> None:
@@ -167,19 +165,19 @@ def test_a_silent_topic_and_a_robot_that_is_gone_are_named(domain: int) -> None:
 @pytest.mark.parametrize("fault", ["--zero-stamp=all", "--clock-offset=86400"])
 def test_stamps_of_zero_and_of_tomorrow_are_of_another_clock_and_nan_is_read_as_it_is(fault: str, domain: int) -> None:
     """The check of all readings above the plants finds what is no number."""
-    plant, out = make(domain, imu=False, silence_s=1.0), PlantReading(1, 2, 360)
+    out = PlantReading(1, 2, 360)
     out.stamp_ns = np.zeros(1, np.int64)
-    with Peer("standin_turtlebot3.py", fault, "--nan=joint_states:0:999", "--nan=scan:0:999", domain=domain):
-        try:
-            plant.open()
-            before = int(plant.state()["count"][0])
-            until(lambda: plant.state()["count"][0] > before + 5, "five more joint states")
-            plant.read(out)
-            assert 0 < plant.state()["arrived_ns"][0] - out.stamp_ns[0] + 1 < 1e9
-            assert np.isnan(out.position).all()
-            np.testing.assert_array_equal(out.sensors, 3.5)  # a reading that is none is no return
-        finally:
-            plant.close()
+    with (
+        Peer("standin_turtlebot3.py", fault, "--nan=joint_states:0:999", "--nan=scan:0:999", domain=domain),
+        closing(make(domain, imu=False, silence_s=1.0)) as plant,
+    ):
+        plant.open()
+        before = int(plant.state()["count"][0])
+        until(lambda: plant.state()["count"][0] > before + 5, "five more joint states")
+        plant.read(out)
+        assert 0 < plant.state()["arrived_ns"][0] - out.stamp_ns[0] + 1 < 1e9
+        assert np.isnan(out.position).all()
+        np.testing.assert_array_equal(out.sensors, 3.5)  # a reading that is none is no return
 
 
 WHEELS = {
@@ -208,36 +206,33 @@ UNUSABLE: dict[str, tuple[str, dict[str, Any], dict[str, Any], str]] = {  # join
 @pytest.mark.thorough(but=3)
 def test_what_cannot_be_used_is_named(what: str, domain: int) -> None:
     msgtype, wheels, changed, text = UNUSABLE[what]
-    plant = make(domain, imu=False, silence_s=1.0)
 
     def sent(_: float) -> list[Sent]:
         stamped = {"header": head()} if msgtype == JOINTS else {}
         return [("/joint_states", msgtype, wheels | stamped), ("/scan", SCAN, scan(RANGES) | changed)]
 
-    with feed(domain, sent, receives=(("/cmd_vel", STAMPED),)):
-        try:
-            plant.link.open(None)
-            until(lambda: re.search(text, plant.link.problem), "it is named")
-        finally:
-            plant.close()
+    with (
+        feed(domain, sent, receives=(("/cmd_vel", STAMPED),)),
+        closing(make(domain, imu=False, silence_s=1.0)) as plant,
+    ):
+        plant.link.open(None)
+        until(lambda: re.search(text, plant.link.problem), "it is named")
 
 
 def test_a_flood_is_read(domain: int) -> None:
-    plant, out = make(domain, imu=False, silence_s=1.0), PlantReading(1, 2, 360)
+    out = PlantReading(1, 2, 360)
     values = json.dumps({name: np.ravel(value).tolist() for name, value in WHEELS.items()})
     flood = ("pub", "/joint_states", JOINTS, values, "--hz=1000", "--burst=10")
     with (
         feed(domain, lambda _: [("/scan", SCAN, scan(RANGES))], hz=5, receives=(("/cmd_vel", STAMPED),)),
         Peer("topic.py", *flood, domain=domain),
+        closing(make(domain, imu=False, silence_s=1.0)) as plant,
     ):
-        try:
-            plant.link.open(patience_s=30.0)
-            plant.read(out)
-            np.testing.assert_array_equal(out.position, [[1.0, 2.0]])
-            count = plant.state()["count"][0]
-            until(lambda: plant.state()["count"][0] > count + 1000, "a thousand more joint states")
-        finally:
-            plant.close()
+        plant.link.open(patience_s=30.0)
+        plant.read(out)
+        np.testing.assert_array_equal(out.position, [[1.0, 2.0]])
+        count = plant.state()["count"][0]
+        until(lambda: plant.state()["count"][0] > count + 1000, "a thousand more joint states")
 
 
 def test_a_network_with_nobody_is_named(domain: int, capsys: pytest.CaptureFixture[str]) -> None:

@@ -190,13 +190,6 @@ def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_
         until(goes_on, "goals are taken again")
 
 
-def test_a_robot_that_is_not_there_is_named(domain: int, tmp_path: Path) -> None:
-    given = ["bridge", "--robot.type=ur5", "--robot.plant=ros2", f"--robot.ros2.domain={domain}"]
-    with Program(serve.main, given, log=tmp_path / "log") as bridge:
-        assert bridge.process.wait() == 2
-        assert "/joint_states" in bridge.text
-
-
 def test_brains_are_looked_for_where_the_robot_is_but_for_what_is_given() -> None:
     robot = UR5Config(plant="ros2", ros2=Ros2Config(domain=7, interface="eth0", peers=["10.0.0.2"]))
     config = BridgeConfig(robot, network=NetworkConfig(domain=9))

@@ -64,15 +64,13 @@ def texts(messages: Messages) -> dict[str, list[str]]:
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_what_is_played_is_recorded_again_with_its_quality_of_service(storage, domain, tmp_path):
     first, second = write(tmp_path / "first", storage), tmp_path / "second"
-    recorder = Fork(main, ["record", "--all", f"--output={second}", f"--domain={domain}"])
-    player = Fork(main, ["play", str(first), f"--domain={domain}", "--wait=60"], output=tmp_path / "printed")
-    try:
+    with (
+        Fork(main, ["record", "--all", f"--output={second}", f"--domain={domain}"]) as recorder,
+        Fork(main, ["play", str(first), f"--domain={domain}", "--wait=60"], output=tmp_path / "printed") as player,
+    ):
         assert player.wait() == 0
         recorder.send_signal(signal.SIGINT)
         assert recorder.wait() == 0
-    finally:
-        player.kill()
-        recorder.kill()
     assert texts(read(second)) == texts(read(first))  # the bytes are filled up to a multiple of four on the network
     times = [received for received, _ in read(second)["/words"]]
     assert times[-1] - times[0] > 0.9 * (COUNT - 1) * STEP  # later it may be, on a busy machine
@@ -94,11 +92,8 @@ def test_a_real_node_receives_what_a_killed_recording_holds(domain: int, tmp_pat
     file.write_bytes(file.read_bytes()[:-300])  # without its end
     with Peer("topic.py", "echo", "/words", TEXT, domain=domain) as peer:
         peer.wait_event("ready")
-        fork = Fork(main, ["play", str(bag), f"--domain={domain}", "--topics", "words", "--loop", "--wait=60"])
-        try:
+        with Fork(main, ["play", str(bag), f"--domain={domain}", "--topics", "words", "--loop", "--wait=60"]):
             until(lambda: len(peer.events("message")) >= 2 * COUNT, "all messages come")
-        finally:
-            fork.kill()
         numbers = [int(line["message"]["data"]) for line in peer.events("message")]
     assert numbers == [number % COUNT for number in range(numbers[0], numbers[0] + len(numbers))]
 

@@ -94,19 +94,17 @@ def check(read: Read) -> None:
 @contextlib.contextmanager
 def recorded(domain: int, tmp_path: Path, *arguments: str) -> Iterator[tuple[Fork, Path]]:
     """Record what `bag_source.py` sends, until all of it can be read."""
-    bag, printed = tmp_path / "bag", tmp_path / "printed"
-    fork = Fork(main, ["record", f"--output={bag}", f"--domain={domain}", *arguments], output=printed)
-    try:
-        heard = tmp_path / "heard"
-        with Peer("bag_source.py", f"--count={COUNT}", f"--heard={heard}", domain=domain) as peer:
-            peer.wait_event("ready")
-            until(lambda: all(counts(bag).get(topic) for topic in (*RELIABLE, "/mixed", "/fast")), "all are heard")
-            heard.touch()
-            peer.wait_event("sent")
-            until(lambda: all(last_of(bag, topic) == COUNT - 1 for topic in RELIABLE), "everything is in the bag")
-            yield fork, bag
-    finally:
-        fork.kill()
+    bag, printed, heard = (tmp_path / name for name in ("bag", "printed", "heard"))
+    with (
+        Fork(main, ["record", f"--output={bag}", f"--domain={domain}", *arguments], output=printed) as fork,
+        Peer("bag_source.py", f"--count={COUNT}", f"--heard={heard}", domain=domain) as peer,
+    ):
+        peer.wait_event("ready")
+        until(lambda: all(counts(bag).get(topic) for topic in (*RELIABLE, "/mixed", "/fast")), "all are heard")
+        heard.touch()
+        peer.wait_event("sent")
+        until(lambda: all(last_of(bag, topic) == COUNT - 1 for topic in RELIABLE), "everything is in the bag")
+        yield fork, bag
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
@@ -310,8 +308,7 @@ def source_of_own(domain: int) -> None:
 def test_a_type_that_nobody_defines_is_named_and_left_out_unless_it_is_defined_here(domain, tmp_path):
     mapping, printed = tmp_path / "map.yaml", tmp_path / "printed"
     mapping.write_text(f"types:\n  {OWN}: int32 number\n")
-    source = Fork(source_of_own, domain)
-    try:
+    with Fork(source_of_own, domain):
         for name, options, wanted in (
             ("without", ("--all",), {"/words"}),
             ("with", ("--all", f"--map={mapping}"), {"/own", "/words"}),
@@ -332,8 +329,6 @@ def test_a_type_that_nobody_defines_is_named_and_left_out_unless_it_is_defined_h
                 assert "No topic was recorded, and no bag was made. /own: Unknown ROS 2 type" in printed.read_text()
             if name != "with":
                 assert f"/own is left out: Unknown ROS 2 type '{OWN}'." in printed.read_text()
-    finally:
-        source.kill()
 
 
 @pytest.mark.law
