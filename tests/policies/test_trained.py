@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -21,6 +20,7 @@ from tests.cases import each_case
 from tests.policies.cnn import test_cnn as cnn
 from tests.policies.mlp import test_mlp as mlp
 from tests.policies.perception import rig as perception
+from tests.policies.perception.rig import save
 from tests.policies.pixels import test_pixels as pixels
 
 IMAGE, SCENE = cnn.IMAGE, perception.IMAGE
@@ -29,14 +29,6 @@ CONFIGS = {"bhd_mlp": mlp.config, "bhd_cnn": cnn.config, "bhd_pixels": pixels.ma
 
 def make(kind: str, **options: Any) -> Any:
     return get_policy_class(kind)(CONFIGS[kind](**options))
-
-
-def save(folder: Path, policy: Any) -> None:
-    policy.save_pretrained(folder)
-    features = {**policy.config.input_features, **policy.config.output_features}
-    stats = {key: {"mean": np.zeros(one.shape[-1]), "std": np.ones(one.shape[-1])} for key, one in features.items()}
-    for one in make_pre_post_processors(policy.config, dataset_stats=stats):
-        one.save_pretrained(folder)
 
 
 MLP_OPTIONS = {"gaussian": True, "n_obs_steps": 2, "scan": ScanConfig(transform="log", channels=[3])}

@@ -89,8 +89,6 @@ def test_what_a_checkpoint_needs_and_this_machine_has_not(folder: Path) -> None:
     ("options", "message"),
     [
         ({"n_action_steps": 7}, "brain.n_action_steps is 7; this 'bhd_mlp' predicts chunks of 6"),
-        ({"n_action_steps": 0}, "brain.n_action_steps is 0; it must be at least 1"),
-        ({"threads": 0}, "brain.threads is 0"),
         ({"sample": True}, "brain.sample is true, but this policy has no distribution"),
         ({"stream": True, "n_action_steps": 1}, "brain.stream is true"),
     ],

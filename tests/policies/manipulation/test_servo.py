@@ -18,6 +18,7 @@ from bhd_lerobot.tasks.task import Event, episode_seed
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.cases import each_case
 from tests.policies.arm_desk import episodes
+from tests.policies.perception.rig import states
 
 POSE = tuple(f"target_{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 TOOL = {"action_space": "tool", "tool_pose": True}
@@ -32,19 +33,6 @@ def tools(n: int, rng: np.random.Generator) -> np.ndarray:
     place = rng.uniform((0.2, -0.4, 0.02), (0.7, 0.4, 0.4), (n, 3))
     quaternion = Rotation.random(n, rng=rng).as_quat(scalar_first=True)
     return np.concatenate([place, quaternion, rng.uniform(0, 0.085, (n, 1))], axis=1)
-
-
-def tables(n: int) -> np.ndarray:
-    """Return what the task tells of n tables, shape (n, 80)."""
-    task = PickTask(PickConfig(), n, 25)
-    scenes = [task.sample(seed) for seed in range(n)]
-    task.begin(np.arange(n), scenes)
-    state = task._fixed.copy()
-    for sim, scene in enumerate(scenes):
-        for place, one in enumerate(scene.objects):
-            half = one.yaw / 2
-            state[sim, place, 3:10] = one.x, one.y, one.height / 2, np.cos(half), 0, 0, np.sin(half)
-    return state.reshape(n, -1)
 
 
 def test_a_gripper_is_not_opened_wider_than_it_opens() -> None:
@@ -77,7 +65,7 @@ def test_steps_are_short_from_wherever_the_tool_is(brain: Any, environment: tupl
     rng = np.random.default_rng(0)
     brain.bind(features(environment))
     state, config = tools(200, rng), brain.config
-    told = tables(200) if environment is ENVIRONMENT else tools(200, rng)[:, :7]
+    told = states(200) if environment is ENVIRONMENT else tools(200, rng)[:, :7]
     action = brain.act(Observation(TOOL_NAMES, state, {}, told))
     way = np.linalg.norm(action[:, :3] - state[:, :3], axis=1)
     assert way.max() <= config.lead_m + 1e-9
@@ -90,7 +78,7 @@ def test_steps_are_short_from_wherever_the_tool_is(brain: Any, environment: tupl
 
 def test_what_is_to_be_done_depends_on_nothing_but_what_is_seen() -> None:
     rng = np.random.default_rng(1)
-    state, told = tools(60, rng), tables(60)
+    state, told = tools(60, rng), states(60)
     brain = pick()
     action = brain.act(Observation(TOOL_NAMES, state, {}, told))
     order = rng.permutation(60)
@@ -102,7 +90,7 @@ def test_what_is_to_be_done_depends_on_nothing_but_what_is_seen() -> None:
 
 def test_a_known_error_of_the_camera_is_taken_away() -> None:
     error = [0.01, -0.02, 0.005]
-    state, told = tools(60, np.random.default_rng(2)), tables(60)
+    state, told = tools(60, np.random.default_rng(2)), states(60)
     wrong = told.reshape(60, MAX_OBJECTS, -1).copy()
     place = OBJECT_FIELDS.index("x")
     wrong[:, :, place : place + 3] += error * (wrong[:, :, :1] > 0)
@@ -115,7 +103,7 @@ def test_a_known_error_of_the_camera_is_taken_away() -> None:
 
 def test_it_opens_wider_only_where_there_is_room() -> None:
     rng = np.random.default_rng(5)
-    told = tables(200)
+    told = states(200)
     state = tools(200, rng)
     state[:, 2] = 0.4  # above everything
     usual, wide = (pick(PickServoConfig(wider_m=more)) for more in (0.0, 0.016))
@@ -137,7 +125,7 @@ def test_it_opens_wider_only_where_there_is_room() -> None:
 def test_without_an_object_or_a_target_it_stays_where_it_is() -> None:
     state = tools(5, np.random.default_rng(3))
     nothing = np.zeros((5, len(ENVIRONMENT)))
-    unknown = tables(5)
+    unknown = states(5)
     unknown.reshape(5, MAX_OBJECTS, -1)[:, 0, 3:6] = np.nan
     for told in (nothing, unknown):
         assert np.allclose(pick().act(Observation(TOOL_NAMES, state, {}, told)), state)

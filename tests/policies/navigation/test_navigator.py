@@ -8,7 +8,7 @@ import pytest
 
 from bhd_lerobot.bodies.arenas import Arena, make_arena
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION, turtlebot3_burger
+from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.goal_map import CELL, GoalMap
@@ -20,14 +20,9 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.cases import each_case
+from tests.policies.navigation.test_gap_follower import ACTIONS, BURGER, names_of
 
-BURGER = turtlebot3_burger()
-ACTIONS = ("x.vel", "theta.vel")
 OPEN = np.full(360, 3.5)
-
-
-def names_of(beams: int) -> tuple[str, ...]:
-    return ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(beams)))
 
 
 def bound(n: int = 1, beams: int = 360, config: NavigatorConfig | None = None) -> NavigatorBrain:

@@ -1,12 +1,14 @@
 """Tables as the pick task tells of them, and images on which each object is a spot of its colour."""
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
@@ -70,3 +72,13 @@ def painted(values: np.ndarray, view: CameraView = SCENE_CAMERA) -> Tensor:
             spot = np.hypot(column + 0.5 - u, row + 0.5 - v) < (5.0 if one.kind == "box" else 3.5)
             image[spot] = one.colour
     return torch.from_numpy(images.transpose(0, 3, 1, 2).copy())
+
+
+def save(folder: Path, policy: Any) -> Path:
+    """Save a policy with its processors, as a training does; return the folder."""
+    policy.save_pretrained(folder)
+    features = {**policy.config.input_features, **policy.config.output_features}
+    stats = {key: {"mean": np.zeros(one.shape[-1]), "std": np.ones(one.shape[-1])} for key, one in features.items()}
+    for one in make_pre_post_processors(policy.config, dataset_stats=stats):
+        one.save_pretrained(folder)
+    return folder

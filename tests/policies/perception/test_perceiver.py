@@ -31,17 +31,19 @@ ARM = {"robot__type": "ur5", "robot__beams": None, "task__type": "pick", "task__
 CAMERA = {"robot__camera": "true", "robot__camera_width": WIDTH, "robot__camera_height": HEIGHT}
 
 
-@pytest.fixture(scope="module")
-def looks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tables with images and true poses."""
-    root = tmp_path_factory.mktemp("perception") / "looks"
+def look(root: Path, **options: Any) -> Path:
+    """Record tables with images and true poses; return the folder."""
+    still = {**ARM, **CAMERA, "brain__type": "noop", "dataset__episode_time_s": 0.04}
     try:
-        run_record(
-            root, **ARM, **CAMERA, brain__type="noop", dataset__episode_time_s=0.04, dataset__num_episodes=24, n_envs=4
-        )
+        run_record(root, **{**still, **options})
     except RenderingError as error:
         pytest.skip(f"no image can be rendered on this machine: {error}")
     return root
+
+
+@pytest.fixture(scope="module")
+def looks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return look(tmp_path_factory.mktemp("perception") / "looks", dataset__num_episodes=24, n_envs=4)
 
 
 def train(root: Path, run: Path, **options: Any) -> Any:
@@ -98,18 +100,8 @@ def test_it_is_evaluated_by_itself_and_reports_how_well_it_saw(run: Path, tmp_pa
 
 
 def test_where_camera_and_table_are_it_is_told_by_the_arm_that_recorded(run: Path, tmp_path: Path) -> None:
-    try:
-        run_record(
-            tmp_path / "looks",
-            **(ARM | {"robot__type": "ur3e"}),
-            **CAMERA,
-            brain__type="noop",
-            dataset__num_episodes=8,
-            dataset__episode_time_s=0.04,
-        )
-    except RenderingError as error:
-        pytest.skip(f"no image can be rendered on this machine: {error}")
-    train(tmp_path / "looks", tmp_path / "run", steps=2, batch_size=4)
+    root = look(tmp_path / "looks", robot__type="ur3e", dataset__num_episodes=8)
+    train(root, tmp_path / "run", steps=2, batch_size=4)
     for folder, robot in ((run, "ur5"), (tmp_path / "run", "ur3e")):
         saved = json.loads((folder / "checkpoints/last/pretrained_model/config.json").read_text())
         workspace = ur(robot).need(Arm).workspace
@@ -203,7 +195,7 @@ def test_datasets_that_do_not_show_or_do_not_say_what_is_there(looks: Path, tmp_
     ):
         told = tmp_path / name
         wrong = {option: value, "task__randomisation__enabled": "true", "dataset__num_episodes": 1, "n_envs": 1}
-        run_record(told, **ARM, **CAMERA, brain__type="noop", dataset__episode_time_s=0.04, **wrong)
+        look(told, **wrong)
         with pytest.raises(DatasetError, match=rf"recorded with task\.{name} = .*would learn them"):
             train(told, tmp_path / "run")
     noisy = tmp_path / "sensing.noise_m"

@@ -17,7 +17,7 @@ from bhd_lerobot.policies.pixels.configuration_pixels import PixelsConfig
 from bhd_lerobot.policies.pixels.modeling_pixels import PixelsPolicy
 from bhd_lerobot.tasks.pick import PickConfig, PickTask
 from tests.cases import each_case
-from tests.policies.perception.rig import HEIGHT, IMAGE, WIDTH, config, painted, states
+from tests.policies.perception.rig import HEIGHT, IMAGE, WIDTH, config, painted, save, states
 
 CHUNK = 4
 NAMES = {OBS_STATE: {"names": [f"joint.{which}" for which in (*"abcdefg", *["vel"] * 7)]}}
@@ -157,15 +157,6 @@ def test_words_count_and_what_is_ignored_does_not() -> None:
     assert torch.equal(act(), act(**{OBS_STATE: fast}))
     fast[:, 0] += 1
     assert not torch.equal(act(), act(**{OBS_STATE: fast}))
-
-
-def save(folder: Path, policy: Any) -> Path:
-    policy.save_pretrained(folder)
-    features = {**policy.config.input_features, **policy.config.output_features}
-    stats = {key: {"mean": np.zeros(one.shape[-1]), "std": np.ones(one.shape[-1])} for key, one in features.items()}
-    for pipeline in make_pre_post_processors(policy.config, dataset_stats=stats):
-        pipeline.save_pretrained(folder)
-    return folder
 
 
 def test_it_begins_with_a_perception_and_needs_it_no_more_afterwards(tmp_path: Path) -> None:

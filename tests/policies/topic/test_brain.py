@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,12 @@ def features(body: Any, *actions: str) -> RobotFeatures:
     return RobotFeatures("robot", actions, (), 10, body=body)
 
 
-def begin(brain: TopicBrain, robot: RobotFeatures) -> None:
-    brain.bind(robot)
-    brain.reset(np.zeros(1, np.intp), [0], 1)
+@contextmanager
+def begun(config: TopicConfig, robot: RobotFeatures) -> Iterator[TopicBrain]:
+    with closing(TopicBrain(config)) as brain:
+        brain.bind(robot)
+        brain.reset(np.zeros(1, np.intp), [0], 1)
+        yield brain
 
 
 def act(brain: TopicBrain, send: Callable[[], None], wanted: Callable[[Any], Any]) -> Any:
@@ -54,9 +58,8 @@ def test_a_base_is_driven_by_twists_and_by_none_that_is_old(node: Node) -> None:
     x, turn = (FieldConfig("t", STAMPED, f"twist.{field}") for field in ("linear.x", "angular.z"))
     [twist] = topics_of({"x": x, "turn": turn}, {})
     publisher = node.publisher("/brain/cmd_vel", STAMPED)
-    brain = TopicBrain(TopicConfig(network=node.network, command_timeout_s=0.3, timeout_s=2.0))
-    begin(brain, features(turtlebot3_burger(), "x.vel", "theta.vel"))
-    try:
+    config = TopicConfig(network=node.network, command_timeout_s=0.3, timeout_s=2.0)
+    with begun(config, features(turtlebot3_burger(), "x.vel", "theta.vel")) as brain:
         action = act(
             brain,
             lambda: publisher.send(twist.encode(np.array([0.1, -0.2]), time.time_ns())),
@@ -66,20 +69,16 @@ def test_a_base_is_driven_by_twists_and_by_none_that_is_old(node: Node) -> None:
         until(lambda: brain.act(NOTHING) is None, "the setpoint is too old")
         with pytest.raises(BrainStoppedError, match=r"no setpoint for 2\.\d s: /brain/cmd_vel has sent no message"):
             until(lambda: [brain.act(NOTHING), False][1], "the episode ends")
-    finally:
-        brain.close()
 
 
 def test_what_is_not_finite_ends_the_episode(node: Node) -> None:
     [twist] = topics_of({"x": FieldConfig("t", STAMPED, "twist.linear.x")}, {})
     publisher = node.publisher("/brain/cmd_vel", STAMPED)
-    brain = TopicBrain(TopicConfig(network=node.network))
-    begin(brain, features(turtlebot3_burger(), "x.vel", "theta.vel"))
-    try:
-        with pytest.raises(BrainStoppedError, match="not finite"):
-            act(brain, lambda: publisher.send(twist.encode(np.array([np.nan]), 0)), lambda _: False)
-    finally:
-        brain.close()
+    with (
+        begun(TopicConfig(network=node.network), features(turtlebot3_burger(), "x.vel", "theta.vel")) as brain,
+        pytest.raises(BrainStoppedError, match="not finite"),
+    ):
+        act(brain, lambda: publisher.send(twist.encode(np.array([np.nan]), 0)), lambda _: False)
 
 
 def test_another_robot_is_driven_by_numbers_in_order_or_by_a_mapping(node: Node, tmp_path: Path) -> None:
@@ -90,13 +89,9 @@ def test_another_robot_is_driven_by_numbers_in_order_or_by_a_mapping(node: Node,
     entry = f"{{topic: /brain/commands, type: {kind}, field: 'data[%d]'}}"
     mapping.write_text(f"action:\n  b.pos: {entry % 0}\n  a.pos: {entry % 1}\n")
     for path, expected in (("", [[1.0, 2.0]]), (str(mapping), [[2.0, 1.0]])):
-        brain = TopicBrain(TopicConfig(path, node.network))
-        begin(brain, features(None, "a.pos", "b.pos"))
-        try:
+        with begun(TopicConfig(path, node.network), features(None, "a.pos", "b.pos")) as brain:
             send = lambda: publisher.send(floats.encode(np.array([1.0, 2.0]), 0))  # noqa: E731
             assert act(brain, send, lambda found: found is not None).tolist() == expected
-        finally:
-            brain.close()
 
 
 @pytest.mark.law
