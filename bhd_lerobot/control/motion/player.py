@@ -47,7 +47,8 @@ class TrajectoryPlayer:
         """
         if len(self._next) != 1:
             raise ValueError(f"Rows of {len(self._next)} arms lie in one block; only a single one may borrow.")
-        self._next[0], self._end[0], self.rows = 0, len(rows), rows
+        # Machine code counts on their type; what is so already is not copied.
+        self._next[0], self._end[0], self.rows = 0, len(rows), np.ascontiguousarray(rows, np.float64)
 
     def stop(self, sim: int) -> None:
         """Play nothing for an arm: its reference stays as it is."""
