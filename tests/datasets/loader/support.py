@@ -113,7 +113,7 @@ def record_light(root: Path, *args: Any, **options: Any) -> Path:
     return root
 
 
-def record_stock(root: Path, episodes: int = 3, *, cameras: bool = False) -> Path:
+def record_stock(root: Path, *, cameras: bool = False) -> Path:
     """Record with nothing but LeRobot: AV1 video by its defaults, images in the data files, a matrix column."""
     features: dict[str, dict[str, Any]] = {
         "observation.state": FEATURES["observation.state"],
@@ -126,7 +126,7 @@ def record_stock(root: Path, episodes: int = 3, *, cameras: bool = False) -> Pat
         features[FRONT] = {"dtype": "video", "shape": (*SIZE, 3), "names": names}
         features[PHOTO] = {"dtype": "image", "shape": (*SIZE, 3), "names": names}
     dataset = LeRobotDataset.create("t/stock", FPS, features, root=root, use_videos=cameras)
-    for episode in range(episodes):
+    for episode in range(3):
         front, photo = (images(episode, key, length(episode)) for key in (FRONT, PHOTO))
         rng = np.random.default_rng(episode)
         for i in range(length(episode)):

@@ -34,7 +34,10 @@ def install(folder: Path) -> None:
         for there, here in changes.items() if file.suffix == ".cmake" or data.startswith(b"#!") else ():
             data = data.replace(there.encode(), here.encode())
         if data != before:
+            mode = file.stat().st_mode
+            file.unlink()  # it may be linked into the installer's cache, from which the next environment is made
             file.write_bytes(data)
+            file.chmod(mode)
 
 
 @pytest.mark.thorough
