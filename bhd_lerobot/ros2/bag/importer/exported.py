@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,16 @@ from bhd_lerobot.bodies.registry import body_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.ros2.bag.importer.resample import NANO, Times
-from bhd_lerobot.ros2.bag.storage.read import Bag, Topic
+from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
 from bhd_lerobot.ros2.messages import presets, types
-from bhd_lerobot.ros2.messages.mapping import FieldConfig, ImageConfig, MappingConfig, features_of, topics_of
+from bhd_lerobot.ros2.messages.mapping import (
+    FieldConfig,
+    ImageConfig,
+    MappingConfig,
+    TopicFields,
+    features_of,
+    topics_of,
+)
 from bhd_lerobot.ros2.messages.parts import image_topic
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.table import SCAN
@@ -57,20 +65,24 @@ class Exported:
         return later[-1] if later else self.episodes[0]
 
 
+@lru_cache(maxsize=1)
 def exported(bag: Bag) -> Exported | None:
-    """Return what a bag states; None of any other, and of one whose statement is damaged."""
+    """Return what a bag states; None of any other, and of one whose statement is damaged. It is read once."""
     if types.EPISODE_TOPIC not in bag.topics or bag.topics[types.EPISODE_TOPIC].msgtype != types.EPISODE:
         return None
     kinds = dict(zip(_TOPICS, (types.EPISODE, types.STATE, types.OUTCOME), strict=True))
-    found = bag.read(kinds)
     try:
+        _, _, _, first = next(bag.messages([types.EPISODE_TOPIC]))
+        section = _section(bag.topics, decode(types.EPISODE, first), keys.APPLIED_ACTION)
+        applied = topics_of(section, {})
+        found = bag.read([*kinds, *(one.topic for one in applied)])
         heads, states, outcomes = [[decode(kinds[topic], data) for data in found[topic].data] for topic in kinds]
         received = found[types.EPISODE_TOPIC].received.tolist()
         episodes = [_episode(*one, states, outcomes) for one in zip(heads, received, strict=True)]
-        for episode, applied in zip(episodes, _applied(bag, heads), strict=False):
-            episode.columns[keys.APPLIED_ACTION] = applied
+        for episode, values in zip(episodes, _applied(found, applied, heads), strict=False):
+            episode.columns[keys.APPLIED_ACTION] = values
         return Exported(heads[0].robot_type, heads[0].fps, _mapping(bag.topics, heads[0]), episodes)
-    except (DatasetError, IndexError, KeyError, TypeError, ValueError):
+    except (DatasetError, IndexError, KeyError, StopIteration, TypeError, ValueError):
         return None  # damaged; import names what it lacks
 
 
@@ -95,16 +107,18 @@ def _nanoseconds(stamp: Any) -> int:
     return int(stamp.sec * NANO + stamp.nanosec)
 
 
-def _applied(bag: Bag, heads: Sequence[Any]) -> list[NDArray[np.float32]]:
+def _applied(
+    found: Mapping[str, Messages], topics: Sequence[TopicFields], heads: Sequence[Any]
+) -> list[NDArray[np.float32]]:
     """Return what was applied in the frames of each episode; nothing if messages are missing."""
-    section, ends = _section(bag.topics, heads[0], keys.APPLIED_ACTION), np.cumsum([head.frames for head in heads])
-    values = np.zeros((ends[-1], len(section)), np.float32)
-    for one in topics_of(section, {}):
-        messages = bag.read([one.topic])[one.topic].data
+    ends = np.cumsum([head.frames for head in heads])
+    values = np.zeros((ends[-1], sum(len(one.columns) for one in topics)), np.float32)
+    for one in topics:
+        messages = found[one.topic].data
         if len(messages) != len(values):
             return []
         values[:, one.columns] = [one.read(decode(one.msgtype, data)) for data in messages]
-    return np.split(values, ends[:-1]) if section else []
+    return np.split(values, ends[:-1]) if topics else []
 
 
 def _mapping(topics: Mapping[str, Topic], head: Any) -> MappingConfig | None:

@@ -66,7 +66,7 @@ class Messages:
         return Messages(self.received[mask], self.order[mask], data)
 
 
-@dataclass
+@dataclass(eq=False)
 class Bag:
     """A bag.
 
