@@ -12,7 +12,7 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, edit_lines, logged_now
 from bhd_lerobot.datasets.assembly.creation import build_root
 from bhd_lerobot.datasets.assembly.picks import Pick
-from bhd_lerobot.datasets.format.identity import FORMAT, differences
+from bhd_lerobot.datasets.format.identity import FORMAT, conflicts
 from bhd_lerobot.datasets.format.state import DatasetState, corrupt, load_state, no_dataset, read_json
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import (
@@ -285,8 +285,7 @@ def _common(recordings: Sequence[Mapping[str, Any]], *, of_one_type: bool = Fals
 def _differing(recordings: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the options of the robot that recordings, or those that they were merged of, state differently."""
     first, *others = [recording.get("robot", {}) for recording in recordings]
-    lines = [line for other in others for line in differences("robot", first, other)]
-    names = {line.partition(": ")[0] for line in lines if ": recorded " in line and ", requested " in line}
+    names = {name for other in others for name, *_ in conflicts("robot", first, other)}
     return sorted(names.union(*(recording.get("differing", ()) for recording in recordings)))
 
 

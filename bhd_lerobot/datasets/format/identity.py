@@ -12,6 +12,7 @@ from bhd_lerobot.errors import ConfigError, DatasetMismatchError
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
+_MISSING: Any = object()
 
 
 def as_json(recording: Mapping[str, Any]) -> dict[str, Any]:
@@ -76,20 +77,30 @@ def comparable(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 def differences(prefix: str, recorded: Any, requested: Any) -> Iterator[str]:
     """Yield a line for every value below `prefix` that is not the same in both."""
-    if isinstance(recorded, dict) and isinstance(requested, dict):
-        for key in [*recorded, *(key for key in requested if key not in recorded)]:
+    for name, one, other in _unequal(prefix, recorded, requested):
+        was, wanted = (
+            f"not {what}" if value is _MISSING else f"{what} {as_text(value)}"
+            for what, value in (("recorded", one), ("requested", other))
+        )
+        yield f"{name}: {was}, {wanted}"
+
+
+def conflicts(prefix: str, one: Any, other: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name and both values of what two descriptions state differently; what only one states is none."""
+    return ((name, *both) for name, *both in _unequal(prefix, one, other) if _MISSING not in both)
+
+
+def _unequal(prefix: str, one: Any, other: Any) -> Iterator[tuple[str, Any, Any]]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in [*one, *(key for key in other if key not in one)]:
             name = f"{prefix}.{key}" if prefix else str(key)
-            if key not in recorded:
-                yield f"{name}: not recorded, requested {_short(requested[key])}"
-            elif key not in requested:
-                yield f"{name}: recorded {_short(recorded[key])}, not requested"
-            else:
-                yield from differences(name, recorded[key], requested[key])
-    elif recorded != requested:
-        yield f"{prefix}: recorded {_short(recorded)}, requested {_short(requested)}"
+            yield from _unequal(name, one.get(key, _MISSING), other.get(key, _MISSING))
+    elif one != other:
+        yield prefix, one, other
 
 
-def _short(value: Any) -> str:
+def as_text(value: Any) -> str:
+    """Return a value of a description as a short text."""
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 120 else f"{text[:80]} ... ({len(text)} characters)"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bhd_lerobot.datasets.assembly.assemble import EDITS
-from bhd_lerobot.datasets.format.identity import differences
+from bhd_lerobot.datasets.format.identity import as_text, conflicts
 from bhd_lerobot.datasets.format.info import InfoError, parse_object
 from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.remote.listing import CARD, PREVIEW, RemoteFile, is_recorded, matching, parse_info
@@ -167,12 +167,8 @@ def _conflicts(theirs: bytes | None, ours: Mapping[str, Any] | None) -> list[str
         there, here = dict(parse_object(theirs or b"{}")["recording"]), dict((ours or {})["recording"])
     except (InfoError, KeyError, TypeError, ValueError):
         return []  # one of another program
-    lines = differences("", {**there, "edited": None}, {**here, "edited": None})
-    return [
-        line.replace(": recorded ", ": there ").replace(", requested ", ", here ")
-        for line in lines
-        if ": recorded " in line and ", requested " in line
-    ]
+    found = conflicts("", {**there, "edited": None}, {**here, "edited": None})
+    return [f"{name}: there {as_text(one)}, here {as_text(other)}" for name, one, other in found]
 
 
 def _kind(info: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -89,7 +89,7 @@ class BaseGoals(Goals):
     def __init__(self, host: LiveHost) -> None:
         self._host = host
         self._features = RobotFeatures(
-            host.observation_names, host.action_names, host.rates.fps, GOAL, host.body, robot_type=host.config.type
+            host.sensed_names, host.action_names, host.rates.fps, GOAL, host.body, robot_type=host.config.type
         )
         self._period_ns = NANOSECONDS // host.rates.fps
         self._brain = NavigatorBrain()
