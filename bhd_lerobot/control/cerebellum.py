@@ -26,7 +26,7 @@ from bhd_lerobot.control.messages import (
 )
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.control.reading_check import ReadingCheck
-from bhd_lerobot.control.record import JOINTS, Robots, new_states, put
+from bhd_lerobot.control.record import JOINTS, RobotRecords, new_states, put
 from bhd_lerobot.control.tick import drop_all, judge_all, report, tick_arms, tick_bases, tick_mobile_arms, tick_springs
 from bhd_lerobot.errors import ConfigError
 
@@ -128,7 +128,7 @@ class Cerebellum:
 
     def _group(self) -> None:
         queues, words, reading = self._fifo.queues, self._estop.words, self.reading
-        self.robots = Robots(self.states, queues, words, self.numbers, reading.sensors, reading.sensors_ns)
+        self.robots = RobotRecords(self.states, queues, words, self.numbers, reading.sensors, reading.sensors_ns)
 
     def load(self, *, with_ticks: bool = True) -> None:
         """Load the machine code of its calls, which is compiled if the cache has none, before a loop begins.
@@ -197,7 +197,7 @@ class Cerebellum:
         self.now_ns = now_ns
         self._read()
         goes_on = False
-        while not self._tick_all.run(self.robots, *self.controller.parts, now_ns, goes_on):
+        while not self._tick_all.run(self.robots, *self.controller.groups, now_ns, goes_on):
             self.serve()
             goes_on = True
         if np.count_nonzero(self._mode_is_new):

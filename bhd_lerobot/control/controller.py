@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import BrainCommand, CommandResult, Feedback, ResultCode
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.record import LIMITS, Arms, Springs, new_states
+from bhd_lerobot.control.record import LIMITS, ArmRecords, SpringRecords, new_states
 
 
 class Controller(ABC):
@@ -78,10 +78,10 @@ class Controller(ABC):
         return None
 
     @property
-    def parts(self) -> tuple[Any, Arms | None, Springs | None]:
+    def groups(self) -> tuple[Any, ArmRecords | None, SpringRecords | None]:
         """The records of its drives' monitors, of its arms and of its impedances, as ticks take them."""
-        arms = None if self.arms is None else Arms(self.arms, self.arm_limits, self.geometries, self.rows)
-        return self.monitors, arms, None if self.springs is None else Springs(self.springs, self.arm_limits)
+        arms = None if self.arms is None else ArmRecords(self.arms, self.arm_limits, self.geometries, self.rows)
+        return self.monitors, arms, None if self.springs is None else SpringRecords(self.springs, self.arm_limits)
 
     @abstractmethod
     def at_rest(self) -> NDArray[np.bool_]:

@@ -464,7 +464,7 @@ GEOMETRY = record(
 
 
 @group
-class Robots(NamedTuple):
+class RobotRecords(NamedTuple):
     """What ticks of n robots need, whatever parts they have.
 
     Attributes:
@@ -485,7 +485,7 @@ class Robots(NamedTuple):
 
 
 @group
-class Arms(NamedTuple):
+class ArmRecords(NamedTuple):
     """What ticks need of arms with position servos.
 
     Attributes:
@@ -502,7 +502,7 @@ class Arms(NamedTuple):
 
 
 @group
-class Springs(NamedTuple):
+class SpringRecords(NamedTuple):
     """What ticks need of arms with torque motors.
 
     Attributes:

@@ -19,7 +19,7 @@ from bhd_lerobot.control.kernels import kernel
 from bhd_lerobot.control.messages import HORIZON_NS, SEQUENCE_STEP, Limit, Mode, Reason, Watchdog
 from bhd_lerobot.control.plant import SafetyStatus
 from bhd_lerobot.control.reading_check import LARGEST, are_motions_wrong, are_positions_wrong, is_time_wrong
-from bhd_lerobot.control.record import NEVER, Arms, Robots, Springs
+from bhd_lerobot.control.record import NEVER, ArmRecords, RobotRecords, SpringRecords
 
 _HOLD, _TRACKING, _STOPPING, _SAFE_OFF = (int(Mode[name]) for name in ("HOLD", "TRACKING", "STOPPING", "SAFE_OFF"))
 _UNCONFIGURED, _ESTOP, _FAULT = int(Mode.UNCONFIGURED), int(Mode.ESTOP), int(Mode.FAULT)
@@ -320,7 +320,7 @@ def follow_controller(state: Any, limits: Any) -> None:
 
 @kernel()
 def tick_robot(  # noqa: PLR0917
-    sim: int, robots: Robots, monitors: Any, arms: Arms | None, springs: Springs | None, now_ns: int
+    sim: int, robots: RobotRecords, monitors: Any, arms: ArmRecords | None, springs: SpringRecords | None, now_ns: int
 ) -> bool:
     """Run one tick of one of n robots, see `tick`; what they do not have is None.
 
@@ -350,7 +350,12 @@ def tick_robot(  # noqa: PLR0917
 
 @kernel()
 def tick_all(  # noqa: PLR0917
-    robots: Robots, monitors: Any, arms: Arms | None, springs: Springs | None, now_ns: int, goes_on: bool
+    robots: RobotRecords,
+    monitors: Any,
+    arms: ArmRecords | None,
+    springs: SpringRecords | None,
+    now_ns: int,
+    goes_on: bool,
 ) -> bool:
     """Run one tick of n robots, see `tick_robot`.
 
@@ -371,10 +376,10 @@ def tick_all(  # noqa: PLR0917
     return is_over
 
 
-ROBOTS = "Robots(state[::1], queue[::1], i8[:,::1], limits[::1], f8[:,::1], i8[::1])"
+ROBOTS = "RobotRecords(state[::1], queue[::1], i8[:,::1], limits[::1], f8[:,::1], i8[::1])"
 MONITORS = "monitor[::1]"
-ARMS = "Arms(arm[::1], arm_limits[::1], geometry[::1], f8[:,:,::1])"
-SPRINGS = "Springs(spring[::1], arm_limits[::1])"
+ARMS = "ArmRecords(arm[::1], arm_limits[::1], geometry[::1], f8[:,:,::1])"
+SPRINGS = "SpringRecords(spring[::1], arm_limits[::1])"
 tick_bases = tick_all.of("tick_bases", f"b1({ROBOTS}, {MONITORS}, none, none, i8, b1)")
 tick_arms = tick_all.of("tick_arms", f"b1({ROBOTS}, none, {ARMS}, none, i8, b1)")
 tick_mobile_arms = tick_all.of("tick_mobile_arms", f"b1({ROBOTS}, {MONITORS}, {ARMS}, none, i8, b1)")

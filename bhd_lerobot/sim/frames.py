@@ -22,7 +22,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS
 from bhd_lerobot.control.cerebellum import Cerebellum
 from bhd_lerobot.control.kernels import Kernel, group, is_plain, kernel, record
 from bhd_lerobot.control.messages import NANOSECONDS
-from bhd_lerobot.control.record import JOINTS, Arms, Robots, Springs
+from bhd_lerobot.control.record import JOINTS, ArmRecords, RobotRecords, SpringRecords
 from bhd_lerobot.control.tick import ARMS, MONITORS, ROBOTS, SPRINGS, tick_robot
 from bhd_lerobot.sim.engine import mujoco
 from bhd_lerobot.sim.plant import Brakes, run_brake, set_brake
@@ -191,10 +191,10 @@ def run_frames(  # noqa: PLR0917
     physics: Physics,
     warnings: NDArray[np.int32],
     counted: NDArray[np.int32],
-    robots: Robots,
+    robots: RobotRecords,
     monitors: Any,
-    arms: Arms | None,
-    springs: Springs | None,
+    arms: ArmRecords | None,
+    springs: SpringRecords | None,
     brakes: Any,
     delay: Delay | None,
 ) -> None:
@@ -259,7 +259,7 @@ run_spring_frames = run_frames.of("run_spring_frames", f"void({_RUN}, none, none
 
 
 @kernel()
-def is_waiting(sim: int, arms: Arms | None) -> bool:
+def is_waiting(sim: int, arms: ArmRecords | None) -> bool:
     """Return whether a tick of a simulation has begun, and waited for its controller."""
     if arms is not None:
         return arms.records[sim].stage != 0
@@ -412,7 +412,7 @@ class Frames:
         self._free: SimpleQueue[_Thread] = SimpleQueue()
         self._pool: ThreadPoolExecutor | None = None
         self._addresses, done, zeros = np.zeros((3, world.n), np.int64)
-        self._one_tick = Ticks(np.zeros(1, np.int64), done, seen)
+        self._ticks = Ticks(np.zeros(1, np.int64), done, seen)
         self._is_prepared = False
         self._at_once = None if late is None else Delay(np.zeros((0, 1, 1)), zeros, zeros, 0)
         self._checked, self._copies = -1, False
@@ -477,7 +477,7 @@ class Frames:
             return False
         times = np.arange(first_tick, first_tick + ticks) * NANOSECONDS // own.control_hz
         self._begin(ids)
-        self._run(ids, self._one_tick._replace(times=times))
+        self._run(ids, self._ticks._replace(times=times))
         own.now_ns = int(times[-1])
         self._end(ticks)
         return True
@@ -495,19 +495,19 @@ class Frames:
                 return False
         if not self._are_copied:
             return False
-        own.now_ns = self._one_tick.times[0] = now_ns
+        own.now_ns = self._ticks.times[0] = now_ns
         self._begin(_FIRST)
         thread = self._threads[0]
         while True:
-            thread.run(self._kernel, _FIRST, self._one_tick, *self._parts)
-            if self._one_tick.done[0]:
+            thread.run(self._kernel, _FIRST, self._ticks, *self._parts)
+            if self._ticks.done[0]:
                 break
             own.serve()
         self._end(1)
         return True
 
     def _begin(self, ids: NDArray[np.intp]) -> None:
-        self._one_tick.done[ids] = 0
+        self._ticks.done[ids] = 0
         if (arms := self._cerebellum.controller.arms) is not None:
             arms["stage"] = 0  # whatever interrupted the last frame
 
@@ -585,7 +585,7 @@ class Frames:
     def _parts(self) -> tuple[Any, ...]:
         """What `run_frames` takes behind the physics, as it is now."""
         own, late = self._cerebellum, self._late
-        monitors, arms, springs = own.controller.parts
+        monitors, arms, springs = own.controller.groups
         brakes = None if springs is None or self._brakes is None else self._brakes.ticks
         delay = self._at_once
         if late is not None and late.is_late:
@@ -653,15 +653,19 @@ class _Thread:
             layouts=layout.copy(),
         )
         self._outputs = 0
-        self._checked: Robots | None = None  # those whose arrays' types were checked
+        self._checked: RobotRecords | None = None  # those whose arrays' types were checked
         self._lock = Lock()  # after an interruption the last frame may still be running
 
-    def run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, robots: Robots, *parts: Any) -> None:
+    def run(
+        self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, robots: RobotRecords, *parts: Any
+    ) -> None:
         """Let ticks of some simulations go by."""
         with self._lock:
             self._run(one, ids, ticks, robots, *parts)
 
-    def _run(self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, robots: Robots, *parts: Any) -> None:
+    def _run(
+        self, one: Kernel[..., None], ids: NDArray[np.intp], ticks: Ticks, robots: RobotRecords, *parts: Any
+    ) -> None:
         outputs = self._world.outputs
         if len(outputs) != self._outputs:
             row = self._physics.layouts[0]

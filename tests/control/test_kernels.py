@@ -19,7 +19,7 @@ from bhd_lerobot.control.arm.step import Stage
 from bhd_lerobot.control.drive import BaseController, read_odometry
 from bhd_lerobot.control.kernels import Kernel
 from bhd_lerobot.control.plant import PlantReading
-from bhd_lerobot.control.record import Arms, Robots
+from bhd_lerobot.control.record import ArmRecords, RobotRecords
 from tests.control.test_wire import arm, base_rig, twist_rig
 
 ROOT = Path(bhd_lerobot.__file__).parents[1]
@@ -110,9 +110,9 @@ def drawn(kind: Any, rng: np.random.Generator) -> Any:
     """Return an argument of a type, large enough for two robots with up to six values."""
     if isinstance(kind, tuple):
         made = [drawn(one, rng) for one in kind]
-        if isinstance(kind, Robots):  # the words of emergency stops
+        if isinstance(kind, RobotRecords):  # the words of emergency stops
             made[2] = drawn_array("i8", (3, 2), rng)
-        elif isinstance(kind, Arms):
+        elif isinstance(kind, ArmRecords):
             made[3] = drawn_array("f8", (2, 3, 8), rng)
         return type(kind)(*made)  # type: ignore[arg-type]
     if kind.name == "none":
