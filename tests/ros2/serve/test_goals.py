@@ -26,7 +26,8 @@ class Base:
         arena = make_arena("turtlebot3_world", 0, robot_radius=self.config.body().drive.radius)
         self.simulation.reset(np.zeros(1, np.intp), [arena], [0])
         self.rates, self.body = self.simulation.rates, self.simulation.body
-        self.observation_names, self.action_names = self.simulation.observation_names, self.simulation.action_names
+        self.observation_names, self.sensed_names = self.simulation.observation_names, self.simulation.sensed_names
+        self.action_names = self.simulation.action_names
         self.bridge: Any = self
         self.sent: list[NDArray[np.float64]] = []
 
