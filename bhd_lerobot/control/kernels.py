@@ -21,11 +21,7 @@ from numpy.typing import NDArray
 
 _is_plain = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 _LOCK = RLock()  # numba's cache folder is set for the whole process
-# The code that may be compiled, as it is now: numba notices no change of what a kernel calls.
-_SIM = Path(__file__).parents[1] / "sim"
-_SOURCES = *sorted(Path(__file__).parent.rglob("*.py")), _SIM / "frames.py", _SIM / "plant.py"
-_CODE = b"".join(source.read_bytes() for source in _SOURCES)
-
+_OWN_CODE = Path(__file__).read_bytes()
 
 RECORDS: dict[str, np.dtype[Any]] = {}
 """Structured types that signatures name."""
@@ -106,8 +102,21 @@ class Kernel[**P, R]:
         with _LOCK:
             return self._compile(numba, config)
 
+    @property
+    def code(self) -> str:
+        """What is compiled: its bytecode and that of the kernels that it calls, with the constants that they name."""
+        kernels: list[Kernel[..., Any]] = [self]
+        parts = []
+        for one in kernels:  # which grows
+            code, scope = one.function.__code__, one.function.__globals__
+            named = {name: scope[name] for name in code.co_names if name in scope}
+            constants = {name: value for name, value in named.items() if isinstance(value, int | float | tuple)}
+            parts.append(repr((code.co_code, code.co_consts, code.co_names, one.function.__defaults__, constants)))
+            kernels += [value for value in named.values() if isinstance(value, Kernel) and value not in kernels]
+        return "\n".join(parts)
+
     def _compile(self, numba: Any, config: Any) -> Callable[..., R]:
-        folder = _folder()
+        folder = _folder(self.code)
         if folder is None or not any(folder.glob(f"*/*.{self.function.__name__}-*.nbi")):
             _announce()
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder)
@@ -260,13 +269,16 @@ def _announce() -> None:
     print("Compiling the control loop for this processor: up to half a minute, once", file=sys.stderr)
 
 
-@cache
-def _folder() -> Path | None:
-    """Return the folder of the compiled kernels of this code on this processor; None if it cannot be written."""
+def _folder(kernel_code: str) -> Path | None:
+    """Return the folder of the machine code of a kernel on this processor; None if it cannot be written.
+
+    It is named by all that is compiled: numba looks at the file of the outermost kernel alone.
+    """
     from llvmlite import binding
 
     code = hashlib.sha256(f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}".encode())
-    code.update(_CODE)
+    code.update(_OWN_CODE)
+    code.update(kernel_code.encode())
     code.update(os.environ.get("NUMBA_BOUNDSCHECK", "").encode())
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

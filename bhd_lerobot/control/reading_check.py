@@ -147,9 +147,8 @@ class ReadingCheck:
         """Accept the next readings of some robots, whatever they are."""
         for name in ("near", "seen_position", "seen_velocity"):
             self._states[name][ids] = np.nan
-        for name in ("same_ticks", "off", "way"):
+        for name in ("same_ticks", "off", "way", "problem", "silence_ns"):
             self._states[name][ids] = 0
-        self._states["problem"] = self._states["silence_ns"] = 0
 
     @property
     def problem(self) -> str:

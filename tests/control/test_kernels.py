@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 import bhd_lerobot
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control import kernels
+from bhd_lerobot.control.arm import setpoints, spring
 from bhd_lerobot.control.arm.step import Stage
 from bhd_lerobot.control.drive import BaseController, read_odometry
 from bhd_lerobot.control.kernels import Kernel
@@ -187,11 +189,41 @@ def test_no_kernel_raises_to_a_power() -> None:
 
 
 @pytest.mark.law
-def test_no_machine_code_outlives_a_change_of_a_kernel() -> None:
-    """The cache's folder is named by the code of all kernels: numba looks at the file of the outermost one alone."""
-    for path in sorted((ROOT / "bhd_lerobot").rglob("*.py")):
-        code = path.read_bytes()
-        assert b"\n@kernel(" not in code or code in kernels._CODE, path
+def test_no_machine_code_outlives_a_change_of_what_a_kernel_calls_or_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled = {name: one.code for name, one in KERNELS.items()}
+
+    def changed() -> set[str]:
+        return {name for name, code in compiled.items() if KERNELS[name].code != code}
+
+    assert not changed()
+    for module, name, value in (
+        (setpoints, "_APPROACH", 0.6),
+        (setpoints, "stoppable", kernels.kernel()(lambda room, *_: room)),
+        (spring, "_ENTERED", (1,)),
+        (spring, "clamp", kernels.kernel()(lambda value, low, high: value)),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            assert changed() >= {"tick_arms", "tick_springs"}, name
+            assert "read_odometry" not in changed()
+    assert not changed()
+
+
+@pytest.mark.law
+def test_what_kernels_name_is_part_of_their_code() -> None:
+    """Numbers are; modules are the interpreter's and numba's, whose versions are; C functions are called by name."""
+    libraries = {"math", "np", "fence", "_copy", "_get_state", "_set_state", "_step"}
+    kinds = (int, float, tuple, kernels.Kernel)
+    for one in {value for module in list(sys.modules.values()) for value in vars(module).values() if is_kernel(value)}:
+        code, scope = one.function.__code__, one.function.__globals__
+        assert one.function.__closure__ is None
+        assert not any(isinstance(constant, CodeType) for constant in code.co_consts)
+        named = {name: scope[name] for name in code.co_names if name in scope and name not in libraries}
+        assert not {name: value for name, value in named.items() if not isinstance(value, kinds)}, one
+
+
+def is_kernel(value: Any) -> bool:
+    return isinstance(value, kernels.Kernel) and value.__module__.startswith("bhd_lerobot.")
 
 
 @pytest.mark.parametrize("make", [base_rig, twist_rig, arm])

@@ -75,6 +75,17 @@ def test_a_jump_is_none_and_the_last_measurement_stays(joint: int, jump: float) 
     assert not check.problem
 
 
+def test_a_fault_is_explained_until_its_own_robot_is_restarted() -> None:
+    check = Check(2)
+    check.reading.position[:] = ur5().arm.home
+    assert check.wrong(0) == [False, False]
+    check.reading.position[:] += 1.0
+    assert check.wrong(PERIOD) == [True, True]
+    for robot, is_explained in ((0, True), (1, False)):
+        check.forget(np.array([robot]))
+        assert bool(check.problem) == is_explained
+
+
 def test_a_robot_in_a_stop_of_its_own_may_be_moved() -> None:
     check = Check()
     for tick, (safety, moved) in enumerate([(0, 0.0), (SafetyStatus.STOPPED, 0.5), (0, 0.0)]):

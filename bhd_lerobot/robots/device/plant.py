@@ -101,7 +101,7 @@ class DevicePlant(Plant):
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
         self._enabled = False
-        self.hint = "Commands go to the motors by LeRobot. Are they powered, and is the arm free?"
+        self.hint = "Commands go to the motors by LeRobot: check that they are powered, and that the arm is free."
 
     def open(self) -> None:
         """Start the device's process, check what the device is, and connect it.

@@ -104,8 +104,8 @@ def test_reach_is_recorded_with_the_command_of_the_simulation(bus: Bus, tmp_path
         *("--robot.type=so101", "--robot.plant=lerobot", "--robot.device.type=so101_follower", "--robot.device.id=arm"),
         *(f"--robot.device.port={bus.port}", f"--robot.device.calibration_dir={bus.calibration}"),
         *("--robot.realtime.plant_timeout_s=5.0", "--robot.realtime.most_misses=1000000"),
-        *("--robot.realtime.brain_timeout_s=20", "--task.type=reach", "--task.duration_s=60", "--brain.type=reach"),
-        "--brain.max_velocity=0.3",  # on a busy machine the arm is late, and is not to seem blocked
+        *("--robot.realtime.brain_timeout_s=20", "--task.type=reach", "--task.duration_s=120", "--brain.type=reach"),
+        "--brain.max_velocity=0.1",  # on a busy machine the arm is late by a second, and is not to seem blocked
         *(f"--dataset.root={tmp_path / 'd'}", f"--output_dir={tmp_path / 'run'}", "--dataset.num_episodes=1"),
     ]
     console = Console(file=io.StringIO(), width=200)

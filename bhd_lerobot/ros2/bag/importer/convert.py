@@ -187,7 +187,7 @@ class _RobotBag:
     def __init__(self, bag: Bag, options: ImportOptions, recording: _Recording, stated: Exported | None) -> None:
         self.notes: list[str] = []
         self._bag, self._options, self._recording, self._stated = bag, options, recording, stated
-        self._tracks = read_tracks(bag, options, self.notes)
+        self._tracks = read_tracks(bag, options, {} if stated is None else stated.messages, self.notes)
         is_whole = stated is not None and not bag.problems and all(len(one.times) for one in stated.episodes)
         self._is_as_stated = options.as_stated and is_whole
         self._cameras = [CameraImages(bag, track, self.notes) for track in self._tracks if not track.names]

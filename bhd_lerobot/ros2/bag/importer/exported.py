@@ -24,6 +24,7 @@ from bhd_lerobot.ros2.messages.mapping import (
     topics_of,
 )
 from bhd_lerobot.ros2.messages.parts import image_topic
+from bhd_lerobot.ros2.messages.scan import static_topics
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.table import SCAN
 from bhd_lerobot.tasks.task import Event
@@ -52,12 +53,18 @@ class StatedEpisode:
 
 @dataclass(frozen=True)
 class Exported:
-    """What an exported bag states; no mapping if the bag of its robot cannot be read by one."""
+    """What an exported bag states.
+
+    Attributes:
+        mapping: None if the bag of its robot cannot be read by one.
+        messages: of the topics that the mapping names, and of the transforms, read in the same pass.
+    """
 
     robot_type: str
     fps: int
     mapping: MappingConfig | None
     episodes: Sequence[StatedEpisode]
+    messages: Mapping[str, Messages]
 
     def at(self, time: int, *, by_header: bool) -> StatedEpisode:
         """Return the episode that a time [ns] lies in."""
@@ -72,16 +79,22 @@ def exported(bag: Bag) -> Exported | None:
         return None
     kinds = dict(zip(_TOPICS, (types.EPISODE, types.STATE, types.OUTCOME), strict=True))
     try:
-        _, _, _, first = next(bag.messages([types.EPISODE_TOPIC]))
-        section = _section(bag.topics, decode(types.EPISODE, first), keys.APPLIED_ACTION)
-        applied = topics_of(section, {})
-        found = bag.read([*kinds, *(one.topic for one in applied)])
+        _, _, _, data = next(bag.messages([types.EPISODE_TOPIC]))
+        first = decode(types.EPISODE, data)
+        applied, mapping = topics_of(_section(bag.topics, first, keys.APPLIED_ACTION), {}), _mapping(bag.topics, first)
+        numbers = {*static_topics("")} & bag.topics.keys()
+        images: set[str] = set()
+        if mapping is not None:
+            numbers |= {one.topic for one in (*mapping.observation.values(), *mapping.action.values())}
+            images = {one.topic for one in mapping.images.values()}
+        found = bag.read({*kinds, *numbers, *(one.topic for one in applied)}, images)
         heads, states, outcomes = [[decode(kinds[topic], data) for data in found[topic].data] for topic in kinds]
         received = found[types.EPISODE_TOPIC].received.tolist()
         episodes = [_episode(*one, states, outcomes) for one in zip(heads, received, strict=True)]
         for episode, values in zip(episodes, _applied(found, applied, heads), strict=False):
             episode.columns[keys.APPLIED_ACTION] = values
-        return Exported(heads[0].robot_type, heads[0].fps, _mapping(bag.topics, heads[0]), episodes)
+        messages = {name: found[name] for name in numbers | images}
+        return Exported(first.robot_type, first.fps, mapping, episodes, messages)
     except (DatasetError, IndexError, KeyError, StopIteration, TypeError, ValueError):
         return None  # damaged; import names what it lacks
 

@@ -67,14 +67,20 @@ class Track:
         return replace(self, times=times, order=self.order[rows], values=self.values[rows], stamps=stamps)
 
 
-def read_tracks(bag: Bag, options: ImportOptions, notes: list[str]) -> list[Track]:
-    """Return the tracks of a bag, in the order of what is read of it."""
+def read_tracks(bag: Bag, options: ImportOptions, known: Mapping[str, Messages], notes: list[str]) -> list[Track]:
+    """Return the tracks of a bag, in the order of what is read of it.
+
+    Args:
+        known: messages of some topics, which are not read again.
+    """
     wanted = wanted_topics(bag, options.sources)
     notes += publisher_notes(bag, wanted)
     turned = {name for source, _ in wanted if source.is_turned for name in static_topics(source.topic)}
     latched = sorted((turned | {other_form(name) for name in turned}) & bag.topics.keys())
     images = {topic.name for source, topic in wanted if not source.names}
-    messages = bag.read({topic.name for _, topic in wanted} - images | {*latched}, images)
+    messages = dict(known)
+    if unread := ({topic.name for _, topic in wanted} | {*latched}) - known.keys():
+        messages |= bag.read(unread - images, unread & images)
     static, lost = static_frames([one for name in latched for one in messages[name].data])
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
