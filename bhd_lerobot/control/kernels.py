@@ -71,7 +71,7 @@ class Kernel[**P, R]:
 
     def run(self, *arguments: Any) -> R:
         """Run the machine code, or plain Python where nothing is to be compiled."""
-        if _is_plain:
+        if _is_plain or not self.signature:
             python: Callable[..., R] = self.function
             return python(*map(as_objects, arguments))
         return self.compiled(*arguments)
@@ -97,8 +97,8 @@ class Kernel[**P, R]:
         import numba
 
         config: Any = numba.config
-        if not self.signature:
-            return numba.njit(error_model="numpy")(self.function)
+        if not self.signature:  # Python cannot call it, which saves a seventh of the time
+            return numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(self.function)
         with _LOCK:
             return self._compile(numba, config)
 
