@@ -98,7 +98,8 @@ class Kernel[**P, R]:
 
         config: Any = numba.config
         if not self.signature:  # Python cannot call it, which saves a seventh of the time
-            return numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(self.function)
+            options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+            return numba.njit(error_model="numpy", **options)(self.function)
         with _LOCK:
             return self._compile(numba, config)
 
