@@ -12,6 +12,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote
 
 from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.metadata import dump_qos_v8
@@ -64,6 +65,8 @@ class _AppendedMcap:
     def close(self) -> None:
         """Write the block, which is the end of the file, and close it."""
         after = self.tell()
+        if after + len(_END) > self._size:
+            self._extend(len(self._block))
         self._put(bytes(self._block[_HEAD.size :]), self._used + _HEAD.size)
         os.ftruncate(self._file, after)
         self._appear(after)
@@ -116,7 +119,9 @@ class _Sqlite(Sqlite3Writer):
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         with _system_errors(path):
-            super().__init__(path, compression)
+            # `rosbags` puts it into a URI, in which # ends a path and % begins an escape.
+            super().__init__(Path(quote(os.fsencode(path))), compression)
+            self.path = path / f"{path.name}.db3"
             self.conn.execute("PRAGMA synchronous = OFF")  # a process may end at any time, not the system
             self.conn.execute("PRAGMA cache_spill = OFF")
         self._uncommitted = 0

@@ -13,6 +13,7 @@ from bhd_lerobot.ros2.bag.storage.unpack import Budget, room, temporary_copy
 _STEPS = 10_000  # of SQLite's own machine, between two checks of their number
 _LOGS = ("-wal", "-journal")
 _LEAST_STEPS, _STEPS_PER_BYTE = 10_000_000, 20
+_MOST_LENGTH = 2**31 - 1  # [bytes] of a value: what SQLite's limit can be set to
 
 
 class SqliteFile:
@@ -68,7 +69,7 @@ class SqliteFile:
     def _bound(self) -> None:
         """Let no query take more memory or time than the file's size explains."""
         connection = self._connection
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(self._bytes, 1 << 20))
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(self._bytes, 1 << 20), _MOST_LENGTH))
         connection.execute("PRAGMA trusted_schema = OFF")
         # Pages that are linked in a circle are rows without end. SQLite's steps are counted, some ten for a row, and a
         # row has some ten bytes at least.

@@ -155,6 +155,13 @@ def test_a_damaged_database_gives_what_is_before_or_is_refused(tmp_path, bags, m
             find_bags(path)[0].read(TOPICS)
 
 
+def test_a_database_of_gigabytes_is_read(tmp_path, bags, messages):
+    path = tmp_path / "large.db3"
+    shutil.copy(bags["sqlite3"] / "sqlite3.db3", path)
+    os.truncate(path, 3 << 30)  # of which nothing is on the disk
+    assert check(path, messages) == len(messages)
+
+
 @pytest.fixture
 def logged(bags):
     """Return a folder that everybody may read, with a bag whose second half is in its write-ahead log."""

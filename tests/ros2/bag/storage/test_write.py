@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
+from bhd_lerobot.ros2.bag.storage import crash_safe
 from bhd_lerobot.ros2.bag.storage.find import find_bags
 from bhd_lerobot.ros2.bag.storage.write import BagWriter, profile
 from bhd_lerobot.ros2.messages.serialize import encode_one
@@ -32,10 +33,17 @@ def read(path: Path) -> list[int]:
         return [int(bytes(data)[8:14]) for _, _, data in reader.messages()]
 
 
+STEPS = {crash_safe._ROOM: 30, 100: 54}  # the second is less than the end of the file takes, as after hours
+
+
 @pytest.mark.law
-@pytest.mark.parametrize("step", range(3, 31))  # after the two by which the file begins
-def test_an_mcap_file_is_complete_before_and_after_every_step_of_writing_it(step, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("room", "step"),  # after the two by which the file begins; of the second those by which it ends
+    [*((crash_safe._ROOM, step) for step in range(3, 31)), *((100, step) for step in range(51, 55))],
+)
+def test_an_mcap_file_is_complete_before_and_after_every_step_of_writing_it(room, step, tmp_path, monkeypatch):
     bag, copy, steps, real = tmp_path / "bag", tmp_path / "copy.mcap", 0, os.pwrite
+    monkeypatch.setattr(crash_safe, "_ROOM", room)
 
     def pwrite(file: int, data: bytes, place: int) -> int:
         nonlocal steps
@@ -56,7 +64,7 @@ def test_an_mcap_file_is_complete_before_and_after_every_step_of_writing_it(step
     monkeypatch.setattr(BagWriter, "flush", flush)
     monkeypatch.setattr(os, "pwrite", pwrite)
     write(bag, "mcap")
-    assert steps == 30
+    assert steps == STEPS[room]
     least = EACH * len(flushed_before)
     found = read(copy)
     assert found == list(range(len(found)))
@@ -85,6 +93,15 @@ def test_a_bag_is_read_by_others_after_each_flush(storage: str, tmp_path: Path) 
     assert not find_bags(path)[0].problems
     assert find_bags(path)[0].topics["/b"].count == 3
     assert (path / f"bag.{'mcap' if storage == 'mcap' else 'db3'}").stat().st_size < 100_000
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("name", ["drive #1", "a%41?b", "träge"])
+def test_a_bag_lies_in_the_folder_that_was_named(storage: str, name: str, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / name / "bag", storage, {}) as bag:
+        bag.append(bag.connect("/a", TEXT, [profile(10)]), 5, encode_one(TEXT, {"data": "x"}))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert find_bags(tmp_path / name / "bag")[0].read(["/a"])["/a"].received.tolist() == [5]
 
 
 def test_what_sqlite_had_not_committed_when_it_was_killed_is_rolled_back(tmp_path: Path) -> None:
