@@ -16,6 +16,7 @@ _LONGEST_S = 0.1  # between two looks for a request to stop
 _LAST_S = 2.0  # for receivers to have the last messages
 _PAUSE_S = 0.5  # by what is later, what follows is later, too: it does not come all at once
 _MOST_KEPT = 100  # of what a latched topic sent before the start
+_SHORTEST_S = 0.1  # of a round: the bag may have but one message
 
 
 @dataclass(frozen=True)
@@ -111,11 +112,12 @@ class Player:
         kept: dict[str, list[bytes]] = {}  # of latched topics, what was sent before the start
         is_empty = True
         names = {name: "/" + name.lstrip("/") for name in self._bag.topics}
-        wanted = [name for name, topic in names.items() if topic in self._publishers]
-        for name, received, _, data in self._bag.messages(wanted, note=True):
+        for name, received, _, data in self._bag.messages(names, note=True):  # times are those of the whole bag
             first = received if first is None else first
             length_s = max(length_s, (received - first) / 1e9)
             topic = names[name]
+            if stop():
+                return False
             if length_s < options.start:
                 if topic in self._latched:
                     kept.setdefault(topic, []).append(data)
@@ -125,6 +127,8 @@ class Player:
                 is_empty = False
                 self._send_kept(kept)
                 begun = time.monotonic()
+            if topic not in self._publishers:
+                continue
             due = begun + (length_s - options.start) / options.rate
             if not self._sleep_until(due, stop):
                 return False
@@ -138,7 +142,8 @@ class Player:
                 f"--start is {options.start:g}; the messages of {self._bag.path} end after {length_s:.3g} s."
             )
         self.report.rounds += 1
-        return True
+        end = begun + max(length_s - options.start, _SHORTEST_S) / options.rate
+        return not options.loop or self._sleep_until(end, stop)
 
     def _send_kept(self, kept: dict[str, list[bytes]]) -> None:
         for topic, several in kept.items():

@@ -126,6 +126,27 @@ def test_a_late_start_begins_with_what_was_latched_before(listener: Any, domain:
     assert numbers(listener, "/robot1/latched") == [-1]
 
 
+def test_times_are_those_of_the_bag_whichever_topics_are_published(listener: Any, domain: int, tmp_path: Path) -> None:
+    bag, printed = tmp_path / "bag", tmp_path / "printed"
+    with BagWriter(bag, "mcap", {}) as writer:
+        first, late = (writer.connect(topic, TEXT, [TOPICS[topic]]) for topic in ("/robot1/latched", "/words"))
+        writer.append(first, START, text(-1))
+        for number in range(COUNT):
+            writer.append(late, START + (COUNT + number) * STEP, text(number))
+    arguments = [str(bag), f"--domain={domain}", f"--start={(1.5 * COUNT - 0.5) * STEP / 1e9}", "--topics"]
+    assert play(*arguments, "/words", output=printed).wait() == 0
+    found: list[Any] = []
+    until(lambda: found.extend(numbers(listener, "/words")) or len(found) >= COUNT // 2, "all messages")
+    assert found == list(range(COUNT // 2, COUNT))
+    # A latched topic that has nothing after the start; and one that has nothing until the bag's end begins with it anew.
+    assert play(*arguments, "/robot1/latched", output=printed).wait() == 0
+    assert numbers(listener, "/robot1/latched") == [-1]
+    with play(str(bag), f"--domain={domain}", "--loop", "--topics", "/robot1/latched", output=printed):
+        found = []
+        until(lambda: found.extend(listener["/robot1/latched"].take()) or len(found) >= 3, "the third round")
+    assert found[2].sent_ns - found[1].sent_ns > 0.9 * 2 * COUNT * STEP
+
+
 def test_a_loop_begins_anew_until_it_is_ended(listener: Any, domain: int, tmp_path: Path) -> None:
     bag, printed = write(tmp_path / "bag"), tmp_path / "printed"
     fork = play(str(bag), f"--domain={domain}", "--loop", "--rate=10", output=printed)
