@@ -6,7 +6,7 @@ from pathlib import Path
 from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.cli.data.episode_list import parse_episodes
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import ConfigError, counted
+from bhd_lerobot.errors import ConfigError, counted, quoted
 from bhd_lerobot.ros2.bag.exporter.episode import START_S, ExportOptions
 from bhd_lerobot.ros2.bag.exporter.export import export_bags
 from bhd_lerobot.ros2.bag.storage.write import FORMATS
@@ -51,5 +51,6 @@ def _run(options: argparse.Namespace) -> int:
     )
     what = counted(report.episodes, "episode")
     bags = counted(len(report.bags), "bag")
-    print(f"{options.output}: {what}, {report.messages} messages, in {bags}. Play one: ros2 bag play {report.bags[0]}")
+    play = f"ros2 bag play {quoted(report.bags[0])}"
+    print(f"{options.output}: {what}, {report.messages} messages, in {bags}. Play one: {play}")
     return 0

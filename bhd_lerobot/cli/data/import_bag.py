@@ -43,7 +43,9 @@ def add_to(commands: Commands) -> None:
     command.add_argument("--fps", type=int, help="frames a second (default: 10, or those of an exported bag)")
     command.add_argument("--stamps", help="source of timestamps: receive (default), header or auto")
     command.add_argument("--max_age", type=float, metavar="S", help="age of a reading that makes a frame late")
-    command.add_argument("--max_gap", type=float, metavar="S", help="silence that ends an episode (default: 1.0)")
+    command.add_argument(
+        "--max_gap", type=float, metavar="S", help="silence that ends an episode (default: 1.0, or a longer --max_age)"
+    )
     command.add_argument(
         "--min_episode_s", type=float, metavar="S",
         help="shorter episodes are left out (default: 1.0; 0 of an exported bag)",
@@ -105,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _common(options: argparse.Namespace) -> dict[str, Any]:
     """Return how bags are read whichever robot it is, by the names in `ImportOptions`."""
-    stamps, max_gap = options.stamps or _STAMPS[0], 1.0 if options.max_gap is None else options.max_gap
+    stamps = options.stamps or _STAMPS[0]
     if stamps not in _STAMPS:
         raise ConfigError(unknown_name("stamps", stamps, _STAMPS))
     if options.outcome is not None and options.outcome not in OUTCOMES:
@@ -122,6 +124,7 @@ def _common(options: argparse.Namespace) -> dict[str, Any]:
     assert lidar is not None
     # As `bhd-record` judges it: a frame, and a period of the slowest sensor.
     max_age = 1 / fps + 1 / lidar.rate_hz if options.max_age is None else options.max_age
+    max_gap = max(1.0, max_age) if options.max_gap is None else options.max_gap
     for name, value, at_least in (("max_age", max_age, 0.0), ("max_gap", max_gap, max_age)):
         if not value > 0 or value < at_least or math.isinf(value):
             raise ConfigError(
@@ -218,7 +221,7 @@ def _of_mapping(options: argparse.Namespace, mapping: MappingConfig, common: dic
             "robot holds it."
         )
     return ImportOptions(
-        robot_type=options.robot or Path(options.map or "robot").stem,
+        robot_type=options.robot if common["robot_is_stated"] else options.robot or Path(options.map or "robot").stem,
         observation_names=observed,
         action_names=actions,
         sources=tuple(mapped_sources(mapping, options.scan_frame, options.scan_yaw)),

@@ -134,7 +134,8 @@ class IntegersPart(NumbersPart):
 
 def own_topic(key: str) -> str:
     """Return the topic of a feature that goes into a message of ours."""
-    return "/bhd/" + re.sub(r"[^A-Za-z0-9_]+", "_", key).strip("_")
+    name = re.sub(r"[^A-Za-z0-9_]+", "_", key).strip("_")
+    return f"/bhd/{name}" if name[:1].isalpha() else f"/bhd/feature_{name}"  # no name in ROS begins with a digit
 
 
 def camera_name(key: str) -> str:

@@ -85,13 +85,13 @@ def gyro_message(noise: BaseNoise | None = None) -> dict[str, Any]:
     return {"msgtype": IMU_TYPE, "name": "GyroPart", "frame": IMU_FRAME, "rest": rest}
 
 
-def check_topics(parts: Iterable[Part]) -> None:
-    """Check that no two parts share a topic."""
+def check_topics(topics: Iterable[str]) -> None:
+    """Check that no two features share a topic, nor one with what every bag has."""
     seen: set[str] = set()
-    for part in parts:
-        if part.topic in seen:
+    for topic in topics:
+        if topic in seen:
             raise UnsupportedDatasetError(
-                f"Two features would share the topic {part.topic}, because their names differ only in characters that "
-                "no topic may have. Rename one."
+                f"A feature would share the topic {topic}: with another one, because their names differ only in "
+                "characters that no topic may have, or with what every exported bag has there. Rename it."
             )
-        seen.add(part.topic)
+        seen.add(topic)

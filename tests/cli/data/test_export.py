@@ -2,6 +2,7 @@
 
 import re
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +19,13 @@ from bhd_lerobot.cli.data import main
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.features import dataset_features
+from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
+from bhd_lerobot.errors import UnsupportedDatasetError
+from bhd_lerobot.ros2.bag.exporter.episode import EpisodeTopics, ExportOptions
+from bhd_lerobot.ros2.messages.views import RobotView
+from tests.cases import each_case
 from tests.datasets import support
 from tests.recording.support import run_record
 
@@ -64,6 +70,25 @@ def decoded(path):
         for _, channel, message, content in reader.iter_decoded_messages():
             found[channel.topic].append((message.log_time, content))
     return found
+
+
+VIDEO = {"dtype": "video", "shape": [4, 4, 3]}
+
+
+@each_case(
+    ("features", "fps", "message"),
+    [
+        ({"depth": {**VIDEO, "shape": [4, 4, 1]}}, 10, r"'depth' of data is of type video, shape \(4, 4, 1\)"),
+        ({"outcome": {"dtype": "string", "shape": [1]}}, 10, "share the topic /bhd/outcome"),
+        ({"note.a": {"dtype": "string", "shape": [1]}, "note_a": {"dtype": "int64", "shape": [2]}}, 10, "/bhd/note_a"),
+        ({f"observation.images.a{sign}b": VIDEO for sign in "-_"}, 10, "share the topic /a_b/image_raw"),
+        ({"front": VIDEO}, 29.97, r"29\.97 frames a second; bags state a whole number"),
+    ],
+)
+def test_what_no_bag_can_hold_is_refused_before_anything_is_written(features, fps, message):
+    state = DatasetState(Path("data"), {"features": features, "fps": fps}, None)
+    with pytest.raises(UnsupportedDatasetError, match=message):
+        EpisodeTopics(state, RobotView(), "", ExportOptions())
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.ros2.bag.exporter.episode import scan_stream
 from bhd_lerobot.ros2.messages import types
 from bhd_lerobot.ros2.messages.base import ScanPart
-from bhd_lerobot.ros2.messages.parts import Frames, header, header_stamps
+from bhd_lerobot.ros2.messages.parts import Frames, header, header_stamps, image_topic, own_topic
 from bhd_lerobot.ros2.messages.serialize import decode, encode
 from bhd_lerobot.ros2.messages.split import parts_of
 from bhd_lerobot.ros2.messages.views import TF
@@ -46,6 +46,13 @@ def test_trees_of_arrays_become_messages():
     ]
     with pytest.raises(KeyError, match="no field"):
         encode(SCAN, {"beams": 3}, 1)
+
+
+@pytest.mark.parametrize("name", ["front", "cam-1", "0", "3d.left", "カメラ", "_x_"])
+def test_features_of_every_name_have_topics_that_ros_takes(name):
+    valid = r"(/[A-Za-z][A-Za-z0-9_]*)+"
+    topics = [own_topic(name), *(image_topic(f"observation.images.{name}", compressed=one) for one in (True, False))]
+    assert all(re.fullmatch(valid, topic) for topic in topics), topics
 
 
 @pytest.mark.parametrize("little", [True, False])

@@ -38,6 +38,7 @@ from bhd_lerobot.ros2.messages.table import JOINTS
 _PLAIN = (arrow.is_string, arrow.is_boolean, arrow.is_integer, arrow.is_floating, arrow.is_list, arrow.is_null)
 _LONGEST_S = 1e8  # three years, longer than any recording
 _PAUSE_NS = 10 * NANO  # between two episodes
+_APART_NS = 2000  # of two frames at least; an import takes times within a microsecond for the same
 START_S = 1_000_000_000  # [s] since 1970: a dataset does not know on which day it was recorded
 
 
@@ -66,6 +67,10 @@ class EpisodeTopics:
         self._features: dict[str, Any] = {k: v for k, v in state.info["features"].items() if k not in DEFAULT_FEATURES}
         self._robot = str(state.info.get("robot_type") or "")
         self._next_start = round(options.start_s * NANO)
+        if state.info["fps"] % 1:
+            raise UnsupportedDatasetError(
+                f"{state.root} has {state.info['fps']} frames a second; bags state a whole number of them."
+            )
         for name, kind in state.metadata_types.items():
             if not any(is_one(kind) for is_one in _PLAIN):
                 raise UnsupportedDatasetError(
@@ -73,20 +78,29 @@ class EpisodeTopics:
                     "and lists of them."
                 )
         self._parts = {key: self._parts_of(key) for key in self._features}
-        check_topics(part for parts in self._parts.values() for part in parts)
+        check_topics([*(part.topic for parts in self._parts.values() for part in parts), *self._other_topics()])
         self.custom = {"bhd_format": str(types.FORMAT), "bhd_repo_id": repo_id, "bhd_robot_type": self._robot}
+
+    def _other_topics(self) -> Iterator[str]:
+        """Yield the topics of texts and of cameras, and those that every episode has."""
+        yield from (types.EPISODE_TOPIC, types.STATE_TOPIC, types.OUTCOME_TOPIC)
+        for key, feature in self._features.items():
+            if feature["dtype"] == "video":
+                yield image_topic(key, compressed=self._options.compressed_images)
+            elif feature["dtype"] in ("string", "language") and key != keys.SUBTASK:
+                yield own_topic(key)
 
     def _parts_of(self, key: str) -> list[Part]:
         feature = self._features[key]
         kind, shape = feature["dtype"], tuple(feature["shape"])
         if key in (*types.STATE_COLUMNS, *types.OUTCOME_COLUMNS, keys.SUBTASK) and shape == (1,):
             return []
-        if kind in ("video", "string", "language"):
+        if kind in ("string", "language") or (kind == "video" and 3 in (shape[0], shape[-1])):
             return []
         if len(shape) != 1 or kind not in ("float32", "float64", "int64", "bool"):
             raise UnsupportedDatasetError(
                 f"Feature {key!r} of {self._state.root} is of type {kind}, shape {shape}; bags are made of vectors of "
-                "float32, float64, int64 and bool, of texts and of video."
+                "float32, float64, int64 and bool, of texts and of video in colour."
             )
         names = keys.numbered_names_of(feature)
         if kind in ("int64", "bool"):
@@ -184,7 +198,7 @@ class EpisodeTopics:
             "format": types.FORMAT,
             "repo_id": self._repo_id,
             "robot_type": self._robot,
-            "fps": self._state.info["fps"],
+            "fps": int(self._state.info["fps"]),
             "episode_index": row["episode_index"],
             "frames": row["length"],
             "task": row["tasks"][0] if row["tasks"] else "",
@@ -215,8 +229,8 @@ def _split(
 
 
 def _rising(stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return stamps of which each is later than the one before, by a nanosecond at least."""
-    steps = np.arange(len(stamps))
+    """Return stamps of which each is later than the one before, by more than what an import takes for the same time."""
+    steps = _APART_NS * np.arange(len(stamps))
     return np.maximum.accumulate(stamps - steps) + steps
 
 

@@ -24,7 +24,7 @@ from bhd_lerobot.ros2.bag.importer.columns import (
 )
 from bhd_lerobot.ros2.bag.importer.exported import Exported, StatedEpisode, exported
 from bhd_lerobot.ros2.bag.importer.options import ImportOptions
-from bhd_lerobot.ros2.bag.importer.resample import NANO, Grid, grids, newest
+from bhd_lerobot.ros2.bag.importer.resample import NANO, ROUNDING_NS, Grid, grids, newest
 from bhd_lerobot.ros2.bag.importer.segments import segments, silence_notes
 from bhd_lerobot.ros2.bag.importer.tracks import Track, read_tracks, seconds
 from bhd_lerobot.ros2.bag.importer.video import CameraImages
@@ -134,6 +134,7 @@ class _Recording:
         self.late: list[tuple[int, str]] = []
         self._folder, self._repo_id, self._options = folder, repo_id, options
         self._recorder: DatasetRecorder | None = None
+        self._has_outcomes: bool | None = None
         self._seen: dict[tuple[int, ...], Path] = {}
 
     def finalize(self) -> None:
@@ -156,6 +157,16 @@ class _Recording:
                 recording=options.identity(),
             )
         return self._recorder
+
+    def refuse_mixed(self, bag: Path, outcome: str | None) -> None:
+        """Refuse a bag that states outcomes where others do not, or the other way round."""
+        if self._has_outcomes is None:
+            self._has_outcomes = outcome is not None
+        if self._has_outcomes != (outcome is not None):
+            raise DatasetError(
+                f"{bag} states {'no outcomes' if outcome is None else 'outcomes'} of its episodes, unlike the bags "
+                "before it. Give one for all with --outcome, or import it by itself."
+            )
 
     def refuse_again(self, bag: Path, start: int, columns: Mapping[str, NDArray[Any]]) -> None:
         """Refuse a drive that is in another bag, too: one that was copied, or converted to another storage."""
@@ -230,7 +241,8 @@ class _RobotBag:
             for one in stated:
                 rows = np.stack([newest(times, one.times) for times in readings])
                 ages = one.times - np.stack([times[row] for times, row in zip(readings, rows, strict=True)])
-                if (blind := int((rows < 0).any(axis=0).sum())) < len(one.times):
+                is_of_another = ages > one.times - one.times[0] + ROUNDING_NS  # an episode before, in the same bag
+                if (blind := int(((rows < 0) | is_of_another).any(axis=0).sum())) < len(one.times):
                     yield _Episode(Grid(one.times, ages, "start").since(blind), tracks, one)
             return
         parts = segments(
@@ -314,6 +326,7 @@ class _RobotBag:
                 own = set() if options.robot_is_stated else {keys.APPLIED_ACTION}  # in the units of another mapping
                 own |= {keys.SUCCESS, keys.EVENT} if self._options.outcome else set()
                 columns |= {key: values for key, values in stated.columns.items() if key not in own}
+            self._recording.refuse_mixed(self._bag.path, options.outcome)
             self._recording.refuse_again(self._bag.path, int(times[0]), columns)
             writer.set_columns(columns)
             recorder.save(writer, task=options.task, metadata=self._metadata(episode, columns, options.outcome))

@@ -1,7 +1,9 @@
 """Export and import again: the same episodes, whichever robot it is; and what of it other options leave."""
 
+import json
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.format import statistics
 from bhd_lerobot.datasets.format.columns import read_episode, video_frames
 from bhd_lerobot.datasets.format.summary import EpisodeSummary, dataset_info
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
@@ -17,6 +20,7 @@ from bhd_lerobot.ros2.bag.storage.find import find_bags
 from bhd_lerobot.ros2.bag.storage.write import BagWriter, Stream
 from bhd_lerobot.tasks.task import Event
 from tests.cases import each_case
+from tests.datasets import foreign
 from tests.recording.support import run_record
 
 SCAN = tuple(f"scan_{beam:03d}.pos" for beam in range(36))
@@ -27,13 +31,14 @@ OUTCOMES = ("success", "nothing", "timeout")
 
 def by_hand(root: Path, robot: str, observed: tuple[str, ...], actions: tuple[str, ...], **options: Any) -> Path:
     """A recording of the wall clock: frames at 30 Hz that jitter, some left out; readings of 5 Hz that are old."""
-    rng, fps = np.random.default_rng(5), options.pop("fps", 30)
+    rng, fps, is_judged = np.random.default_rng(5), options.pop("fps", 30), options.pop("is_judged", True)
     features = keys.dataset_features(observed, actions, {"front": (32, 48, 3)} if robot == "ros2" else {}, {})
     with DatasetRecorder.create("t/t", fps, features, robot_type=robot, root=root) as recorder:
         for number, outcome in enumerate(OUTCOMES):
             n = 1 if number == 1 else 40
             time = np.arange(n) / fps + rng.uniform(0, 0.02, n)
             time[n // 2 + 1 :] += 1.4  # without a frame, as of a computer that was busy
+            time[8:10] = time[7:8]  # the same record again, as of a control loop that was held up
             state, action = (rng.uniform(0.2, 3.5, (n, len(names))).astype(np.float32) for names in (observed, actions))
             state[:, 2:] = state[np.arange(n) // 6 * 6, 2:]
             writer = recorder.begin_episode()
@@ -47,7 +52,7 @@ def by_hand(root: Path, robot: str, observed: tuple[str, ...], actions: tuple[st
             writer.set_columns(columns)
             for frame in range(n if robot == "ros2" else 0):
                 writer.add_image("observation.images.front", np.full((32, 48, 3), 40 + 4 * frame, np.uint8))
-            ended = {"outcome": outcome, "success": outcome == "success"}
+            ended = {"outcome": outcome, "success": outcome == "success"} if is_judged else {}
             recorder.save(writer, task=f"Bring cup {number}.", metadata=ended)
     return root
 
@@ -102,6 +107,28 @@ def test_an_exported_dataset_comes_back_equal(recorded, tmp_path, robot, layout)
         grey = [image.mean() for image in video_frames(video, 0.0, 40)]
         assert grey == pytest.approx(40 + 4 * np.arange(40), abs=4)
     assert robot == "toy" or main.main(["check", str(back)]) == 0
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("layout", [(), ONE_BAG])
+def test_a_dataset_of_another_program_comes_back_but_for_frames_without_numbers(tmp_path, layout):
+    """Of an unnamed robot at one frame a second, as a float, with nothing but observation and action."""
+
+    def lose(episode: int, columns: foreign.Columns) -> None:
+        columns["observation.state"][: episode == 2, 1] = np.nan
+
+    finite = partial(statistics.column_stats, finite=False)
+    root, back = foreign.write(tmp_path / "d", change=lose, stats_of=finite), tmp_path / "back"
+    info = json.loads((root / "meta/info.json").read_text()) | {"robot_type": None, "fps": 1.0}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    assert run(back, export(root, tmp_path / "bags", *layout)) == 0
+    old, new = dataset_info(root), dataset_info(back)
+    assert (new.robot_type, new.fps) == ("", 1)
+    assert [one.task for one in new.episodes] == [one.task for one in old.episodes]
+    for episode, first in enumerate((0, 0, 1)):
+        ours, theirs = read_episode(root, episode), read_episode(back, episode)
+        for key in (keys.OBSERVATION_STATE, keys.ACTION):
+            assert np.array_equal(ours[key][first:], theirs[key]), key
 
 
 NUMBERS = "topic: /bhd/observation_state, type: bhd_msgs/msg/Numbers, field: 'values[names=theta.vel]', scale: 10"
@@ -167,6 +194,16 @@ def test_bags_of_another_robot_or_rate_are_refused(recorded, tmp_path, capsys, o
     numbers = [f"--map.{key}.lift.pos={{topic: /bhd/{topic}, type: bhd_msgs/msg/Numbers, field: 'values[1]'}}"
                for key, topic in (("observation", "observation_state"), ("action", "action"))]  # fmt: skip
     assert run(tmp_path / "back", *bags, "--fps=20", *numbers) == 0
+
+
+def test_bags_with_outcomes_and_without_need_one_for_all(recorded, tmp_path, capsys):
+    names = ("pan.pos", "lift.pos")
+    unjudged = by_hand(tmp_path / "unjudged", "toy", names, names, is_judged=False)
+    bags = [export(recorded["toy"], tmp_path / "a"), export(unjudged, tmp_path / "b", "--start_time=1000")]
+    for pair, stated in ((bags, "no outcomes"), (bags[::-1], "outcomes")):
+        assert run(tmp_path / "back", *pair) == 2
+        assert f" states {stated} of its episodes, unlike the bags before it" in capsys.readouterr().err
+    assert run(tmp_path / "back", *bags, "--outcome=failure") == 0
 
 
 def copied(bag: Path, path: Path, *, later_ns: int = 0, without: str = "") -> Path:
