@@ -108,13 +108,16 @@ class Player:
         """Publish once; return whether the end was reached."""
         options = self._options
         first: int | None = None
-        begun, length_s = time.monotonic(), 0.0
+        newest, begun, length_s = 0, time.monotonic(), 0.0
         kept: dict[str, list[bytes]] = {}  # of latched topics, what was sent before the start
         is_empty = True
         names = {name: "/" + name.lstrip("/") for name in self._bag.topics}
         for name, received, _, data in self._bag.messages(names, note=True):  # times are those of the whole bag
             first = received if first is None else first
-            length_s = max(length_s, (received - first) / 1e9)
+            if received < newest - _PAUSE_S * 1e9:  # the recorder's clock was set back: the bag goes on from there
+                first, newest = first - (newest - received), received
+            newest = max(newest, received)
+            length_s = (newest - first) / 1e9
             topic = names[name]
             if stop():
                 return False

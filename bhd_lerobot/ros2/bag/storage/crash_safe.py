@@ -126,6 +126,14 @@ class _Sqlite(Sqlite3Writer):
             self.conn.execute("PRAGMA cache_spill = OFF")
         self._uncommitted = 0
 
+    def add_msgtype(self, connection: Any) -> None:
+        with _system_errors(self.path):
+            super().add_msgtype(connection)
+
+    def add_connection(self, connection: Any, offered_qos_profiles: str) -> None:
+        with _system_errors(self.path):
+            super().add_connection(connection, offered_qos_profiles)
+
     def write(self, connection: Any, timestamp: int, data: bytes | memoryview) -> None:
         with _system_errors(self.path):
             super().write(connection, timestamp, data)

@@ -173,6 +173,20 @@ def test_a_player_that_was_stopped_goes_on_at_its_pace(listener: Any, domain: in
     assert sent[-1] - sent[stopped] > 0.9 * (COUNT - 1 - stopped) * STEP
 
 
+def test_what_follows_when_the_clock_was_set_back_does_not_come_at_once(
+    listener: Any, domain: int, tmp_path: Path
+) -> None:
+    bag, half = tmp_path / "bag", COUNT // 2
+    with BagWriter(bag, "mcap", {}) as writer:
+        words = writer.connect("/words", TEXT, [TOPICS["/words"]])
+        for number in range(COUNT):
+            writer.append(words, START + number * STEP - (number >= half) * 3600 * 10**9, text(number))
+    assert play(str(bag), f"--domain={domain}", output=tmp_path / "printed").wait() == 0
+    found: list[Any] = []
+    until(lambda: found.extend(listener["/words"].take()) or len(found) == COUNT, "all messages")
+    assert found[-1].sent_ns - found[half].sent_ns > 0.9 * (COUNT - 1 - half) * STEP
+
+
 def test_commands_and_other_publishers_are_named_before(domain: int, tmp_path: Path) -> None:
     bag, printed = tmp_path / "bag", tmp_path / "printed"
     with BagWriter(bag, "mcap", {}) as writer:
