@@ -236,14 +236,18 @@ class _RobotBag:
         """Yield the episodes that a bag states, or that its sensors allow."""
         options, stated = self._options, () if self._stated is None else self._stated.episodes
         if self._is_as_stated:
-            tracks = [track.part(np.ones(len(track.times), np.bool_)) for track in self._tracks]
-            readings = [track.times for track in tracks if not track.is_action]
             for one in stated:
+                # Of its own messages: those that are left out are not replaced by another episode's in the same bag.
+                first, last = int(one.times[0]) - ROUNDING_NS, int(one.times[-1]) + ROUNDING_NS
+                tracks = [track.part((track.times >= first) & (track.times <= last)) for track in self._tracks]
+                readings = [track.times for track in tracks if not track.is_action]
+                if not all(map(len, readings)):
+                    self.notes.append(f"an episode of {len(one.times)} frames has no readings, and is left out")
+                    continue
                 rows = np.stack([newest(times, one.times) for times in readings])
                 ages = one.times - np.stack([times[row] for times, row in zip(readings, rows, strict=True)])
-                is_of_another = ages > one.times - one.times[0] + ROUNDING_NS  # an episode before, in the same bag
-                if (blind := int(((rows < 0) | is_of_another).any(axis=0).sum())) < len(one.times):
-                    yield _Episode(Grid(one.times, ages, "start").since(blind), tracks, one)
+                blind = int((rows < 0).any(axis=0).sum())
+                yield _Episode(Grid(one.times, ages, "start").since(blind), tracks, one)
             return
         parts = segments(
             self._tracks,

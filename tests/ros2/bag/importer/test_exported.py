@@ -1,6 +1,5 @@
 """Export and import again: the same episodes, whichever robot it is; and what of it other options leave."""
 
-import json
 import re
 import shutil
 from functools import partial
@@ -111,16 +110,16 @@ def test_an_exported_dataset_comes_back_equal(recorded, tmp_path, robot, layout)
 
 @pytest.mark.law
 @pytest.mark.parametrize("layout", [(), ONE_BAG])
-def test_a_dataset_of_another_program_comes_back_but_for_frames_without_numbers(tmp_path, layout):
+@pytest.mark.parametrize("lost", [keys.OBSERVATION_STATE, keys.ACTION])
+def test_a_dataset_of_another_program_comes_back_but_for_frames_without_numbers(tmp_path, layout, lost):
     """Of an unnamed robot at one frame a second, as a float, with nothing but observation and action."""
 
     def lose(episode: int, columns: foreign.Columns) -> None:
-        columns["observation.state"][: episode == 2, 1] = np.nan
+        columns[lost][: episode == 2] = np.nan
 
     finite = partial(statistics.column_stats, finite=False)
     root, back = foreign.write(tmp_path / "d", change=lose, stats_of=finite), tmp_path / "back"
-    info = json.loads((root / "meta/info.json").read_text()) | {"robot_type": None, "fps": 1.0}
-    (root / "meta/info.json").write_text(json.dumps(info))
+    foreign.edit_json(root / "meta/info.json", lambda info: info.update(robot_type=None, fps=1.0))
     assert run(back, export(root, tmp_path / "bags", *layout)) == 0
     old, new = dataset_info(root), dataset_info(back)
     assert (new.robot_type, new.fps) == ("", 1)
