@@ -12,6 +12,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from bhd_lerobot.cli.ros2 import main
 from bhd_lerobot.ros2.bag.player.offer import recorded_qos
+from bhd_lerobot.ros2.bag.player.play import Player, PlayOptions
 from bhd_lerobot.ros2.bag.storage.find import find_bags
 from bhd_lerobot.ros2.bag.storage.read import Topic
 from bhd_lerobot.ros2.bag.storage.write import BagWriter, profile
@@ -145,6 +146,19 @@ def test_times_are_those_of_the_bag_whichever_topics_are_published(listener: Any
         found = []
         until(lambda: found.extend(listener["/robot1/latched"].take()) or len(found) >= 3, "the third round")
     assert found[2].sent_ns - found[1].sent_ns > 0.9 * 2 * COUNT * STEP
+
+
+def test_a_request_to_end_is_heard_on_the_way_to_the_start(domain: int, tmp_path: Path) -> None:
+    (bag,), lines, asked = find_bags(write(tmp_path / "bag")), list[str](), 0
+
+    def stop() -> bool:
+        nonlocal asked
+        asked += "No node subscribes" in "".join(lines)
+        return asked > 1
+
+    with Node("player", NetworkConfig(domain)) as node:
+        player = Player(node, bag, PlayOptions(start=60.0, wait=0.1), lines.append)
+        assert player.run(stop).messages == 0
 
 
 def test_a_loop_begins_anew_until_it_is_ended(listener: Any, domain: int, tmp_path: Path) -> None:
