@@ -139,7 +139,7 @@ def test_times_are_those_of_the_bag_whichever_topics_are_published(listener: Any
     found: list[Any] = []
     until(lambda: found.extend(numbers(listener, "/words")) or len(found) >= COUNT // 2, "all messages")
     assert found == list(range(COUNT // 2, COUNT))
-    # A latched topic that has nothing after the start; and one that has nothing until the bag's end begins with it anew.
+    # A latched topic that has nothing after the start; and in a loop, nothing before the bag's end.
     assert play(*arguments, "/robot1/latched", output=printed).wait() == 0
     assert numbers(listener, "/robot1/latched") == [-1]
     with play(str(bag), f"--domain={domain}", "--loop", "--topics", "/robot1/latched", output=printed):

@@ -107,11 +107,16 @@ def test_a_bag_lies_in_the_folder_that_was_named(storage: str, name: str, tmp_pa
 
 def test_a_database_that_cannot_grow_is_an_error_of_the_system(tmp_path: Path) -> None:
     """Also where a topic is added, not a message."""
-    with pytest.raises(OSError, match="No space left on device"), BagWriter(tmp_path / "bag", "sqlite3", {}) as bag:
-        storage: Any = bag._writer.storage
-        storage.conn.execute("PRAGMA max_page_count = 12")
-        for number in range(1000):
-            bag.connect(f"/a{number}", TEXT, [profile(10)])
+
+    def add_topics() -> None:
+        with BagWriter(tmp_path / "bag", "sqlite3", {}) as bag:
+            storage: Any = bag._writer.storage
+            storage.conn.execute("PRAGMA max_page_count = 12")
+            for number in range(1000):
+                bag.connect(f"/a{number}", TEXT, [profile(10)])
+
+    with pytest.raises(OSError, match="No space left on device"):
+        add_topics()
 
 
 def test_what_sqlite_had_not_committed_when_it_was_killed_is_rolled_back(tmp_path: Path) -> None:
