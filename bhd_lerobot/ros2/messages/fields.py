@@ -13,7 +13,7 @@ from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.ros2.messages.types import type_store, unknown_type
 
 _BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags' Nodetype; what remains is a sequence
-_STEP = re.compile(r"(?P<name>[A-Za-z]\w*)(?:\[(?:(?P<index>\d+)|(?P<key>[A-Za-z]\w*)=(?P<value>[^\]]+))\])?")
+_STEP = re.compile(r"(?P<name>[A-Za-z]\w*)(?:\[(?:(?P<index>\d+)|(?P<key>[A-Za-z]\w*)=(?P<value>.+))\])?")
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,8 @@ def test_a_dataset_of_another_program_comes_back_but_for_frames_without_numbers(
     finite = partial(statistics.column_stats, finite=False)
     root, back = foreign.write(tmp_path / "d", change=lose, stats_of=finite), tmp_path / "back"
     foreign.edit_json(root / "meta/info.json", lambda info: info.update(robot_type=None, fps=1.0))
+    names = {"axes": ["joint[0].pos", "x=y]", "右 2"]}
+    foreign.edit_json(root / "meta/info.json", lambda info: info["features"]["observation.state"].update(names=names))
     assert run(back, export(root, tmp_path / "bags", *layout)) == 0
     old, new = dataset_info(root), dataset_info(back)
     assert (new.robot_type, new.fps) == ("", 1)
