@@ -10,7 +10,7 @@ from typing import Any
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.cli.data.command import Commands, add_command
 from bhd_lerobot.datasets.format.identity import default_root
-from bhd_lerobot.errors import ConfigError, counted, quoted, unknown_name
+from bhd_lerobot.errors import ConfigError, DatasetError, counted, quoted, unknown_name
 from bhd_lerobot.options.parse import read_line
 from bhd_lerobot.ros2.bag.importer.convert import ImportReport, import_bags
 from bhd_lerobot.ros2.bag.importer.exported import exported
@@ -94,6 +94,11 @@ def _run(options: argparse.Namespace) -> int:
     if (found := exported(bags[0])) is not None:
         if mapping is None and all(getattr(options, name) is None for name in ("robot", *_BASE)):
             mapping, options.robot, robot_is_stated = found.mapping, found.robot_type, found.mapping is not None
+            if mapping is None and found.robot_type not in ROBOTS:
+                raise DatasetError(
+                    f"{bags[0].path} was exported of a dataset without a state or an action of floats, each with a "
+                    "name of its own, and an import needs both. --map names fields of its topics to read instead."
+                )
         options.fps = found.fps if options.fps is None else options.fps
         options.min_episode_s = options.min_episode_s or 0.0  # what was an episode is one, however short
     root = default_root(options.repo_id) if options.root is None else options.root.expanduser()

@@ -197,6 +197,22 @@ def test_bags_of_another_robot_or_rate_are_refused(recorded, tmp_path, capsys, o
     assert run(tmp_path / "back", *bags, "--fps=20", *numbers) == 0
 
 
+def test_a_bag_without_a_state_of_floats_is_refused_with_the_way_to_read_it(tmp_path, capsys):
+    root = foreign.write(tmp_path / "d")
+    foreign.edit_json(
+        root / "meta/info.json", lambda info: info["features"]["observation.state"].update(names=["a"] * 3)
+    )
+    bags = export(root, tmp_path / "bags")
+    assert run(tmp_path / "back", bags) == 2
+    assert "without a state or an action of floats, each with a name of its own" in capsys.readouterr().err
+    fields = (("observation", "observation_state", 2), ("action", "action", 0))
+    named = [f"--map.{key}.x={{topic: /bhd/{topic}, type: bhd_msgs/msg/Numbers, field: 'values[{place}]'}}"
+             for key, topic, place in fields]  # fmt: skip
+    assert run(tmp_path / "back", bags, *named) == 0
+    ours, theirs = (read_episode(one, 2) for one in (root, tmp_path / "back"))
+    assert np.array_equal(ours[keys.OBSERVATION_STATE][:, 2], theirs[keys.OBSERVATION_STATE])
+
+
 def test_bags_with_outcomes_and_without_need_one_for_all(recorded, tmp_path, capsys):
     names = ("pan.pos", "lift.pos")
     unjudged = by_hand(tmp_path / "unjudged", "toy", names, names, is_judged=False)
