@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from bhd_lerobot.datasets.storage.atomic import real
 from bhd_lerobot.datasets.storage.disk import write_errors
 from bhd_lerobot.errors import ConfigError, DatasetWriteError, counted
 from bhd_lerobot.options.declared import OneOf, Options, Range
@@ -16,6 +17,7 @@ from bhd_lerobot.ros2.bag.recorder.receive import DEPTH, TopicReceiver
 from bhd_lerobot.ros2.bag.storage.place import refuse_existing
 from bhd_lerobot.ros2.bag.storage.write import FORMATS, BagWriter, profile
 from bhd_lerobot.ros2.live.graph import Endpoint
+from bhd_lerobot.ros2.live.network import Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.live.topics import is_hidden
 from bhd_lerobot.ros2.live.type_description import find_type_of
@@ -91,7 +93,8 @@ class RecordReport:
 @dataclass
 class _Recorded:
     receiver: TopicReceiver
-    connection: Any
+    connection: Any = None
+    offers: list[Qos] = field(default_factory=list)  # those that are in the bag
     last_ns: int = 0
 
 
@@ -105,6 +108,7 @@ class Recorder:
     def __init__(self, node: Node, options: RecordOptions, print_line: Callable[[str], None]) -> None:
         refuse_existing(options.output, "--output")
         self._node, self._options, self._print = node, options, print_line
+        self._folder = real(options.output)  # it may be named by a link, or as the one that this process is in
         self._recorded: dict[tuple[str, str], _Recorded] = {}
         self._unknown: dict[tuple[str, str], float] = {}  # since when there are topics of types that are not known [s]
         self._stack = contextlib.ExitStack()
@@ -142,7 +146,6 @@ class Recorder:
 
     def _record(self, stop: Callable[[], bool]) -> bool:
         """Record until that is to end; return whether the disk is full."""
-        output = self._options.output
         begun = time.monotonic()
         end = None if self._options.seconds is None else begun + self._options.seconds
         discover_at = flush_at = begun
@@ -157,7 +160,7 @@ class Recorder:
             if self._bag is not None and now >= flush_at:
                 self._bag.flush()
                 flush_at = now + _FLUSH_S
-                is_full = shutil.disk_usage(output).free < LEAST_FREE
+                is_full = shutil.disk_usage(self._folder).free < LEAST_FREE
         self._take()
         return is_full
 
@@ -171,7 +174,7 @@ class Recorder:
                 continue
             if key not in self._recorded and not self._begin(key, offered):
                 continue
-            self._recorded[key].receiver.update([one.qos for one in offered])
+            self._update(key, self._recorded[key], offered)
 
     def _begin(self, key: tuple[str, str], offered: list[Endpoint]) -> bool:
         topic, msgtype = key
@@ -184,21 +187,25 @@ class Recorder:
             self.report.left_out[key] = str(error)
             self._print(f"{topic} is left out: {error}")
             return False
-        receiver = TopicReceiver(self._node, topic, msgtype)
-        receiver.update([one.qos for one in offered])
-        if self._bag is None:
-            output = self._options.output
-            if output.is_dir():
-                output.rmdir()  # it is empty, and is made anew
-            self._bag = self._stack.enter_context(BagWriter(output, self._options.storage, {}))
-        profiles = [
-            profile(one.qos.depth, reliable=one.qos.reliable, transient_local=one.qos.transient_local)
-            for one in offered
-        ]
-        self._recorded[key] = _Recorded(receiver, self._bag.connect(topic, msgtype, profiles, offered[0].type_hash))
+        self._recorded[key] = _Recorded(TopicReceiver(self._node, topic, msgtype))
         self.report.counts[key] = 0
         self._print(f"{topic}  {msgtype}")
         return True
+
+    def _update(self, key: tuple[str, str], one: _Recorded, offered: list[Endpoint]) -> None:
+        """Receive what publishers offer, and write what that is: anew for the messages that follow if more come."""
+        offers = [endpoint.qos for endpoint in offered]
+        one.receiver.update(offers)
+        if self._bag is None:
+            if self._folder.is_dir():
+                self._folder.rmdir()  # it is empty, and is made anew
+            self._bag = self._stack.enter_context(BagWriter(self._folder, self._options.storage, {}))
+        if more := [qos for qos in offers if qos not in one.offers]:
+            one.offers += more
+            profiles = [
+                profile(qos.depth, reliable=qos.reliable, transient_local=qos.transient_local) for qos in one.offers
+            ]
+            one.connection = self._bag.connect(*key, profiles, offered[0].type_hash)
 
     def _take(self) -> None:
         shift_ns = time.time_ns() - time.monotonic_ns()

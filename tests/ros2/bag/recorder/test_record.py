@@ -185,9 +185,16 @@ class Recording:
         numbers: of the messages in the bag of each topic, as far as it was written; without those below 0.
     """
 
-    def __init__(self, domain: int, options: RecordOptions, *topics: tuple[str, str, Qos], count: int = 20) -> None:
+    def __init__(
+        self,
+        domain: int,
+        options: RecordOptions,
+        *topics: tuple[str, str, Qos],
+        count: int = 20,
+        heard: Path | None = None,
+    ) -> None:
         self.options, self.topics, self.count = options, topics, count
-        self.heard = options.output.with_suffix(".heard")
+        self.heard = heard or options.output.with_suffix(".heard")
         self.heard.touch()
         self._fork = Fork(source, domain, list(topics), count, self.heard)
         self.node = Node("recorder", NetworkConfig(domain))
@@ -228,6 +235,51 @@ def test_topics_and_types_and_offers_that_come_later_are_recorded(domain: int, t
     assert {topic: len(messages) for topic, messages in read.items()} == {
         topic: sum(count for (name, _), count in report.counts.items() if name == topic) for topic in ("/a", "/b", "/c")
     }
+
+
+def source_of_two(domain: int, more: Path) -> None:
+    """Publish 1 best effort, and 2 latched once a file is there, until killed."""
+    with Node("source", NetworkConfig(domain)) as node:
+        first, second = node.publisher("/a", TEXT, SENSOR_DATA), None
+        while True:
+            first.send(message(TEXT, 1))
+            if more.exists():
+                second = second or node.publisher("/a", TEXT, LATCHED)
+                second.send(message(TEXT, 2))
+            time.sleep(0.01)
+
+
+@pytest.mark.parametrize("storage", ENDINGS)
+def test_what_a_later_publisher_offers_is_in_the_bag(storage, domain, tmp_path):
+    bag, more = tmp_path / "bag", tmp_path / "more"
+
+    def offers() -> set[tuple[int, int]]:
+        (topic,) = find_bags(bag)[0].topics.values()
+        return {(one["reliability"], one["durability"]) for one in topic.profiles}
+
+    def ended() -> bool:
+        found: list[int] = []
+        with contextlib.suppress(Exception):  # it is being written
+            found = [number_of(one) for _, one in by_rosbags(bag)["/a"]]
+            if 1 in found:
+                more.touch()
+            return len(offers()) > 1 or found.count(2) > 1000
+        return False
+
+    with Fork(source_of_two, domain, more), Node("recorder", NetworkConfig(domain)) as node:
+        report = Recorder(node, RecordOptions(bag, storage=storage), lambda line: None).run(ended)
+    assert offers() == {(2, 2), (1, 1)}
+    assert len(by_rosbags(bag)["/a"]) == report.messages
+
+
+@pytest.mark.parametrize("named", [".", "link"])
+def test_an_empty_folder_that_is_there_becomes_the_bag(named, domain, tmp_path, monkeypatch):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "link").symlink_to("bag")
+    monkeypatch.chdir(tmp_path / "bag" if named == "." else tmp_path)
+    with Recording(domain, RecordOptions(Path(named)), ("/a", TEXT, Qos()), heard=tmp_path / "heard") as recording:
+        recording.recorder.run(lambda: recording.recorder.report.messages > 0)
+    assert by_rosbags(tmp_path / "bag")["/a"]
 
 
 def test_times_go_on_when_a_clock_jumps(domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
