@@ -6,6 +6,7 @@ dictionaries, and where an option has a ``type``, its name alone is enough.
 
 import logging
 from collections.abc import Mapping
+from dataclasses import make_dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from lerobot.robots.config import RobotConfig
@@ -13,7 +14,7 @@ from lerobot.robots.robot import Robot
 from rich.console import Console
 
 from bhd_lerobot import registry
-from bhd_lerobot.errors import ConfigError, unknown_name
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import EvalResult
 from bhd_lerobot.evaluation.evaluate import evaluate as run_evaluation
@@ -111,35 +112,35 @@ def train(
     return run_train(config_of(from_options(options)) if config is None else config, console)
 
 
-def make_robot(robot: "str | RobotConfig", **options: Any) -> Robot:
+def make_robot(robot: "str | Mapping[str, Any] | RobotConfig", **options: Any) -> Robot:
     """Return a LeRobot robot, of this package, of LeRobot or of a plug-in; it is not connected.
 
     Args:
-        robot: its type, such as ``"turtlebot3"``, or its configuration.
+        robot: its type, such as ``"turtlebot3"``, a dictionary with its ``type``, or its configuration.
         options: of its configuration.
 
     Raises:
         ConfigError: there is no such robot or option, or a value that cannot be honoured.
     """
-    return make_robot_from_config(_choice(RobotConfig, "robot", robot, options))
+    return make_robot_from_config(_choice("robot", robot, options))
 
 
-def make_brain(brain: str | BrainConfig, **options: Any) -> Brain:
-    """Return a brain, given its type or its configuration, and options of that.
+def make_brain(brain: str | Mapping[str, Any] | BrainConfig, **options: Any) -> Brain:
+    """Return a brain, given its type, a dictionary with it or its configuration, and options of that.
 
     Raises:
         ConfigError: there is no such brain or option, or a value that cannot be honoured.
     """
-    return registry.make_brain(_choice(BrainConfig, "brain", brain, options))
+    return registry.make_brain(_choice("brain", brain, options))
 
 
-def make_task(task: str | TaskConfig, n: int = 1, fps: int = 10, **options: Any) -> Task:
-    """Return a task for n simulations at `fps` frames a second, given its type or configuration, and options of that.
+def make_task(task: str | Mapping[str, Any] | TaskConfig, n: int = 1, fps: int = 10, **options: Any) -> Task:
+    """Return a task for n simulations at `fps` frames a second, given as in `make_brain`, and options of that.
 
     Raises:
         ConfigError: there is no such task or option, or a value that cannot be honoured.
     """
-    return registry.make_task(_choice(TaskConfig, "task", task, options), n, fps)
+    return registry.make_task(_choice("task", task, options), n, fps)
 
 
 def _configured[T](kind: type[T], config: T | None, options: Mapping[str, Any]) -> T:
@@ -157,13 +158,17 @@ def _refuse_both(config: Any, options: Mapping[str, Any]) -> None:
         raise ConfigError(f"Both a configuration and options are given ({', '.join(options)}); give one of them.")
 
 
-def _choice(kind: Any, word: str, given: Any, options: Mapping[str, Any]) -> Any:
+_HOLDERS = {
+    word: make_dataclass(word, [(word, kind)])
+    for word, kind in (("robot", RobotConfig), ("brain", BrainConfig), ("task", TaskConfig))
+}
+
+
+def _choice(word: str, given: Any, options: Mapping[str, Any]) -> Any:
     load_plugins()
-    if not isinstance(given, str):
+    if not isinstance(given, str | Mapping):
         if options:
             raise ConfigError(f"{word} is a configuration, and options of it are given, too: {', '.join(options)}.")
         return given
-    known = kind.get_known_choices()
-    if given not in known:
-        raise ConfigError(unknown_name(word, given, known))
-    return decode(known[given], from_options(options), f"{word}.")
+    chosen = {"type": given} if isinstance(given, str) else given
+    return getattr(decode(_HOLDERS[word], {word: from_options({**chosen, **options})}), word)

@@ -133,6 +133,17 @@ def test_a_notebook_may_interrupt_a_recording_and_go_on(tmp_path) -> None:
     assert fork.wait() == 0, (tmp_path / "out").read_text()
 
 
+def test_a_robot_is_made_of_its_type_or_a_dictionary_also_one_of_lerobot(monkeypatch) -> None:
+    monkeypatch.setattr("bhd_lerobot.api.make_robot_from_config", lambda config: config)
+    for robot in ("so101_follower", {"type": "so101_follower"}):
+        assert bhd.make_robot(robot, port="/dev/ttyACM0").port == "/dev/ttyACM0"
+    assert bhd.make_brain({"type": "gap_follower", "margin_m": 0.1}).config.margin_m == 0.1
+    with pytest.raises(bhd.BhdError, match="Did you mean 'so101_follower'"):
+        bhd.make_robot("so101_folower")
+    with pytest.raises(bhd.BhdError, match="Did you mean 'robot.beams'"):
+        bhd.make_robot("turtlebot3", beens=36)
+
+
 class Forgetful(bhd.SimulatedBase):
     """A plug-in's robot whose author forgot what `send_action` has to return."""
 

@@ -4,12 +4,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from bhd_lerobot.apps.doctor.doctor import RunTrials, examine_and_print
 from bhd_lerobot.apps.doctor.trials import run_trials
 from bhd_lerobot.options.command import Parser, Program, exit_status
 from bhd_lerobot.options.command import run as run_program
+from bhd_lerobot.options.terminal import Terminal
 
 
 def _parser() -> Parser:
@@ -41,7 +40,7 @@ def main(arguments: Sequence[str] | None = None, run: RunTrials = run_trials) ->
         import bhd_lerobot.registry  # noqa: F401  registers the robots
         from bhd_lerobot.apps.doctor.robot import RobotDescription, describe_robot
 
-        return run_program(Program(RobotDescription, lambda config: describe_robot(config, Console())), given)
+        return run_program(Program(RobotDescription, lambda config: describe_robot(config, Terminal())), given)
     return exit_status(lambda: examine_and_print(_parser().parse(arguments), run))
 
 

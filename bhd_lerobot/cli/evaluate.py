@@ -3,12 +3,11 @@
 import sys
 from collections.abc import Sequence
 
-from rich.console import Console
-
 from bhd_lerobot.cli.start import loading
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.options.parse import CommandLine
+from bhd_lerobot.options.terminal import Terminal
 
 
 def program_of(line: CommandLine) -> Program:
@@ -26,7 +25,7 @@ def _compare(config: EvalConfig) -> int:
         from bhd_lerobot.evaluation.plan import print_plan
 
     if config.plan:
-        print_plan(config, Console())
+        print_plan(config, Terminal())
         return 0
     return evaluate(config).exit_status
 

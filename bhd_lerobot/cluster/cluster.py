@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from bhd_lerobot.cluster.config import RayConfig
+from bhd_lerobot.cluster.config import RayConfig, check_address
 from bhd_lerobot.errors import ClusterError
 
 _LOCAL = "local"
@@ -34,6 +34,7 @@ def connected(config: RayConfig) -> Iterator[str]:
     import ray
 
     address = config.address or os.environ.get("RAY_ADDRESS") or _LOCAL
+    check_address(address, "ray.address" if config.address else "RAY_ADDRESS")
     if ray.is_initialized():  # by a program that uses us: it decides about its cluster
         yield address
         return

@@ -42,7 +42,7 @@ class RayConfig(Options, prefix="ray."):
                 f"ray.gpus_per_worker is {self.gpus_per_worker}; it is a share up to 1, or a whole number."
             )
         if self.address is not None:
-            _check_address(self.address)
+            check_address(self.address)
 
 
 def check_engine(config: Any) -> None:
@@ -78,14 +78,15 @@ def check_engine(config: Any) -> None:
         )
 
 
-def _check_address(address: str) -> None:
+def check_address(address: str, name: str = "ray.address") -> None:
+    """Refuse what is no address of a cluster; `name`: where it comes from."""
     if address.startswith("ray://"):
         raise ConfigError(
-            f"ray.address is {address!r}, which is for Ray's client. Start this command on a machine of the cluster "
+            f"{name} is {address!r}, which is for Ray's client. Start this command on a machine of the cluster "
             "with --ray.address=auto, or send it there: ray job submit --address=http://HEAD:8265 -- bhd-record …"
         )
     if address in ("local", "auto"):
         return
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ConfigError(f"ray.address is {address!r}. Valid: local, auto, or host:port such as 10.0.0.1:6379.")
+        raise ConfigError(f"{name} is {address!r}. Valid: local, auto, or host:port such as 10.0.0.1:6379.")

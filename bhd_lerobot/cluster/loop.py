@@ -75,7 +75,7 @@ class ClusterLoop(EpisodeLoop):
             writer.discard()
         job = self._job(min(self._config.n_envs, per_task), video)
         ours = fingerprint(job.robot, job.task, job.fps)
-        for result in self._pool.run(job, ours, tasks, lambda: stop() or self._is_stopped()):
+        for result in self._pool.run(job, ours, tasks, lambda: stop() or self._is_estopped()):
             self.act_times.extend(result["times"])
             for content in result["episodes"]:
                 episode, videos = unpack(content)
@@ -114,7 +114,7 @@ class ClusterLoop(EpisodeLoop):
             checkpoints=read_checkpoints(self._brain_config),
         )
 
-    def _is_stopped(self) -> bool:
+    def _is_estopped(self) -> bool:
         if self.robots.estop_pressed:
             raise ClusterError(f"Emergency stop. Episodes that were running on the cluster were dropped. {CONTINUE}")
         return False

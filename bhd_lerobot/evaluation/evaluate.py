@@ -32,6 +32,7 @@ from bhd_lerobot.evaluation.results import (
 from bhd_lerobot.evaluation.run import BrainRun, jerk_of, open_dataset, prepare, run_episodes, specs_of
 from bhd_lerobot.evaluation.text import number, percent, perception_sentence, sequential_sentence
 from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
+from bhd_lerobot.options.terminal import Terminal
 from bhd_lerobot.realtime.estop import EstopInputs, estop_signal
 from bhd_lerobot.registry import make_robot, make_simulation
 from bhd_lerobot.robots.host.host import describe
@@ -159,7 +160,7 @@ class EvalResult:
 
 def evaluate(config: EvalConfig, console: Console | None = None) -> EvalResult:
     """Run every brain on the same episodes, write results and report."""
-    printed = console or Console()
+    printed = console or Terminal()
     console = console or Console(stderr=True)
     refuse_results(config)
     prepare_view(config.view)

@@ -9,5 +9,6 @@ __all__ = [
     "plugins",
     "registry",
     "shipped",
+    "terminal",
     "units",
 ]

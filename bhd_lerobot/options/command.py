@@ -4,6 +4,7 @@ It imports nothing that takes time: a command begins with it.
 """
 
 import argparse
+import errno
 import logging
 import os
 import re
@@ -25,6 +26,12 @@ FAILED = 2
 INTERRUPTED = 128 + signal.SIGINT
 """The exit status after Ctrl-C."""
 
+_REMEDIES = {
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "Check the permissions of this path."),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Make room there, or name another folder."),
+    errno.EROFS: "The file system is mounted read-only; name another folder.",
+}
+
 
 def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[], str] = "Stopped.") -> int:
     """Run a program; return its status: 2 after an error of ours, without a traceback, and 130 after Ctrl-C."""
@@ -43,9 +50,16 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
         if not _is_unread():
             raise
         return 128 + signal.SIGPIPE
-    except PermissionError as error:
+    except OSError as error:
+        if error.errno not in _REMEDIES:
+            raise
         where = error.filename2 or error.filename
-        print(f"error: {error.strerror}: {where}. Check the permissions of this path.", file=sys.stderr)
+        print(f"error: {error.strerror}{f': {where}' if where else ''}. {_REMEDIES[error.errno]}", file=sys.stderr)
+        return FAILED
+    except RuntimeError as error:
+        if str(error) != "Could not determine home directory.":  # of `Path.expanduser`
+            raise
+        print("error: A path begins with ~ and the name of no user. Your own folder is ~/.", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print(interrupted if isinstance(interrupted, str) else interrupted(), file=sys.stderr)

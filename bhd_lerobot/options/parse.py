@@ -29,17 +29,26 @@ RUN_CONFIG = "config.yaml"
 """What the configuration of a run is called in its folder."""
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """Refuses a key that a mapping has twice, of which YAML would take the last without a word."""
+class _Loader(yaml.SafeLoader):
+    """Reads a date as text, and refuses a key that a mapping has twice, of which YAML would take the last."""
 
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for key in (key for key in keys if isinstance(key, str) and keys.count(key) > 1):
-            place = f"line {node.start_mark.line + 1}"
-            raise yaml.YAMLError(
-                f"the key {key!r} occurs twice in the mapping that begins in {place}; leave one of them"
-            )
-        return dict(super().construct_mapping(node, deep))
+    def flatten_mapping(self, node: Any) -> None:
+        """Check the keys as they are written; what `<<` merges into them afterwards gives way to them."""
+        if not hasattr(node, "has_own_keys"):
+            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+            for key in (key for key in keys if keys.count(key) > 1):
+                place = f"line {node.start_mark.line + 1}"
+                raise yaml.YAMLError(
+                    f"the key {key!r} occurs twice in the mapping that begins in {place}; leave one of them"
+                )
+            node.has_own_keys = True
+        super().flatten_mapping(node)
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in kinds if tag != "tag:yaml.org,2002:timestamp"]
+    for first, kinds in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
 
 
 @dataclasses.dataclass
@@ -65,13 +74,22 @@ class CommandLine:
     def over(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return nested values, those of the file for example, with the options in their place."""
         result = copy.deepcopy(dict(values))
-        for name, value in self.options.items():
+
+        def wholes(option: tuple[str, Any]) -> int:
+            return sum(option[0].startswith(f"{other}.") for other in self.options)
+
+        for name, value in sorted(self.options.items(), key=wholes):  # a whole before its parts, wherever it stands
             *keys, last = name.split(".")
             inner: Any = result
             for key in keys:
-                inner = inner.setdefault(key, {})
+                if inner.get(key) is None:  # as in the file of a run, which has every option
+                    inner[key] = {}
+                inner = inner[key]
                 if not isinstance(inner, dict):
-                    raise ConfigError(f"Option --{name} sets a key of {key!r}, which is a plain value.")
+                    raise ConfigError(
+                        f"Option --{name} sets a key of {key!r}, which is {inner!r}. If that is its type, write it as a "
+                        "key, too: type."
+                    )
             inner[last] = value
         return result
 
@@ -98,8 +116,8 @@ def read_line(arguments: Sequence[str] | CommandLine, command: str = "") -> Comm
         if key in options:
             raise ConfigError(f"Option --{key} was given twice.")
         try:
-            options[key] = text if key == CONFIG_PATH else yaml.safe_load(text)
-        except yaml.YAMLError as error:
+            options[key] = text if key == CONFIG_PATH else yaml.load(text, _Loader)
+        except (yaml.YAMLError, ValueError) as error:
             raise ConfigError(f"The value of --{key}, {text!r}, cannot be read: {error}") from error
     text = options.pop(CONFIG_PATH, None)
     path = None if text is None else Path(text).expanduser()
@@ -156,7 +174,7 @@ def read_file(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
         # JSON's 1e-05 is text in YAML.
-        values = json.loads(text) if path.suffix == ".json" else yaml.load(text, _UniqueKeys)
+        values = json.loads(text) if path.suffix == ".json" else yaml.load(text, _Loader)
     except OSError as error:
         raise ConfigError(
             f"The configuration {str(path)!r} cannot be read: {error.strerror}. Give --config_path a YAML or JSON file."
@@ -256,7 +274,9 @@ def _checked_value(key: str, value: Any, kind: Any) -> Any:
         if isinstance(value, _PLAIN[one]) and (one is bool or not isinstance(value, bool)):
             return value
     separator = ", or " if any(typing.get_origin(one) is list for one in allowed) else " or "
-    raise ConfigError(f"{key} is {value!r}; it must be {separator.join(map(_named, allowed))}.")
+    is_text = str in allowed and isinstance(value, int | float)
+    quotes = f" Text that reads as something else has quotes of its own: --{key}='\"{value}\"'." if is_text else ""
+    raise ConfigError(f"{key} is {value!r}; it must be {separator.join(map(_named, allowed))}.{quotes}")
 
 
 def _named(kind: Any) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from lerobot.robots.config import RobotConfig
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.bodies.scenes import scene_from_json
@@ -72,6 +73,13 @@ class ReplayConfig(Options):
                 "tolerance_m and robot are both given, and not all that a robot observes is in metres. Leave one of "
                 "them out; the differences are printed in any case."
             )
+        if self.robot is not None and (self.mode != "both" or self.output_dir is not None):
+            raise ConfigError(
+                "mode and output_dir are of a replay in simulation, and robot is given. Leave them out, or leave robot "
+                "out."
+            )
+        if self.robot is None and self.gate != GateConfig():
+            raise ConfigError("gate is set, and no robot to send the actions to. Add --robot.type, or leave gate out.")
 
 
 @dataclass(frozen=True)
@@ -253,7 +261,7 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
             "gives them at the start and so differs; state shows whether the record is true to itself."
         )
     results = []
-    title = f"Replay of episode {config.dataset.episode} of {root}: largest differences"
+    title = escape(f"Replay of episode {config.dataset.episode} of {root}: largest differences")
     table = Table(title=title, title_justify="left")
     for heading in ("mode", "position [m]", "angle [rad]", "state", "observed", ""):
         table.add_column(heading, justify="left" if heading in ("mode", "") else "right", no_wrap=True)
@@ -290,7 +298,7 @@ def replay(config: ReplayConfig, console: Console | None = None) -> list[Diverge
             path=path,
         )
     console.print(table)
-    console.print(f"Plots: {folder}")
+    console.print(escape(f"Plots: {folder}"), soft_wrap=True)
     return results
 
 

@@ -32,8 +32,6 @@ def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> BhdTrai
         _refuse_ignored(line.options, values)
     else:
         values = line.file
-    if any(key.startswith("policy.") for key in line.options) and not isinstance(values.get("policy"), dict):
-        values["policy"] = {}
     return config_of(line.over(values), checkpoint)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import socket
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -9,8 +10,13 @@ import pytest
 from bhd_lerobot.cluster import cluster as cluster_module
 from bhd_lerobot.cluster import config
 from bhd_lerobot.cluster.config import RayConfig
+from bhd_lerobot.cluster.loop import ClusterLoop
 from bhd_lerobot.errors import ClusterError, ConfigError
-from tests.recording.support import run_record
+from bhd_lerobot.options.parse import parse
+from bhd_lerobot.recording.config import RecordConfig
+from bhd_lerobot.registry import make_brain, make_robot, make_task
+from bhd_lerobot.rollout.types import EpisodeSpec
+from tests.recording.support import options, run_record
 
 
 def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
@@ -28,6 +34,26 @@ def test_options_that_a_cluster_cannot_honour_are_refused(tmp_path):
         with pytest.raises(ConfigError, match=message):
             run_record(tmp_path / "data", **{"engine": "ray", **wrong})
     assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("address", ["head", "ray://head:10001"])
+def test_an_address_of_the_environment_is_refused_by_its_name(tmp_path, monkeypatch, address):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(ConfigError, match=f"RAY_ADDRESS is '{address}'"):
+        run_record(tmp_path / "data", engine="ray")
+    assert not (tmp_path / "data").exists()
+
+
+def test_an_emergency_stop_ends_a_run_on_a_cluster(tmp_path):
+    config = parse(RecordConfig, options(tmp_path / "data"))
+    pool = SimpleNamespace(workers_for=lambda tasks: 1, run=lambda job, ours, tasks, stop: iter(stop, True))
+    with closing(make_robot(config.robot)) as robots:
+        parts = robots, make_task(config.task, 1, 10, robots.body), make_brain(config.brain)
+        loop = ClusterLoop(*parts, pool=pool, config=config, brain_config=config.brain)
+        robots.estop()
+        with pytest.raises(ClusterError, match="Emergency stop"):
+            next(loop.run([EpisodeSpec(0, 0)]))
 
 
 def test_without_ray_the_message_names_the_command_that_installs_it(tmp_path, monkeypatch):

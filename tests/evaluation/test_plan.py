@@ -3,6 +3,9 @@
 import itertools
 import json
 import math
+import os
+import signal
+import sys
 
 import numpy as np
 import pytest
@@ -72,3 +75,12 @@ def test_a_plan_uses_earlier_results(tmp_path, capsys):
     (tmp_path / "results.json").write_text("{}")
     assert main([*TWO, "--plan=true", f"--output_dir={tmp_path}"]) == 2
     assert "holds no results of bhd-eval" in capsys.readouterr().err
+
+
+def test_a_plan_whose_reader_has_gone_ends_with_the_status_of_that(monkeypatch):
+    """As of `| head -1`; 1 is that of a brain that missed `fail_below`."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        assert main([*TWO, "--plan=true"]) == 128 + signal.SIGPIPE

@@ -8,7 +8,7 @@ import pytest
 
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.options.command import Program, run
-from bhd_lerobot.options.parse import parse
+from bhd_lerobot.options.parse import parse, read_file
 from bhd_lerobot.recording.config import DatasetConfig, RecordConfig
 from bhd_lerobot.training.rl.config import RlConfig
 from tests.cases import each_case
@@ -26,6 +26,28 @@ def test_the_command_line_wins_over_the_file_and_the_file_over_the_defaults(tmp_
     assert (config.seed, config.n_envs, config.robot.beams, config.dataset.fps) == (7, 4, 36, 20)
     assert config.robot.fps == 20  # the robot acts at the dataset's rate
     assert config.dataset.num_episodes == 50
+
+
+def test_a_part_of_a_group_is_set_where_the_file_of_a_run_has_nothing_and_beside_the_whole(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("robot: {type: turtlebot3}\ntask: {type: avoid}\ndataset: {root: d}\nbrain: null\nteleop: null\n")
+    part = "--brain.margin_m=0.1"
+    for options in (["--brain.type=gap_follower", part], [part, "--brain={type: gap_follower, rim_speed: 0.1}"]):
+        brain = parse(RecordConfig, [f"--config_path={path}", *options]).brain
+        assert brain.margin_m == 0.1
+    for options in (["--brain=gap_follower", part], [part, "--brain=gap_follower"]):
+        with pytest.raises(ConfigError, match=r"--brain.margin_m sets a key of 'brain', which is 'gap_follower'"):
+            parse(RecordConfig, [f"--config_path={path}", *options])
+
+
+def test_what_looks_like_a_date_is_text():
+    assert parse(RecordConfig, [*REQUIRED, "--output_dir=2026-11-30"]).output_dir == "2026-11-30"
+
+
+def test_a_mapping_of_a_file_may_be_merged_into_others_which_override_it(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("a: &a {x: 1, y: 1}\nb: {c: &c {<<: *a, y: 2}}\nd: {<<: *c, x: 3}\n")
+    assert read_file(path) == {"a": {"x": 1, "y": 1}, "b": {"c": {"x": 1, "y": 2}}, "d": {"x": 3, "y": 2}}
 
 
 @pytest.mark.parametrize("text", ["1e-2", "0.01", "1.0e-2"])
@@ -52,6 +74,9 @@ def test_numbers_may_have_an_exponent(text):
         (["--dataset=x"], r"has keys of its own, such as dataset\.repo_id"),
         (["--dataset.fps.x=1"], "fps"),
         (["--seed=[1"], "cannot be read"),
+        (["--seed=0x_"], "cannot be read"),
+        (["--gate={max_change: 1, max_change: 2}"], "'max_change' occurs twice"),
+        (["--robot.id=7"], "robot.id is 7; it must be text or null.*: --robot.id='\"7\"'"),
         (["--config_path=missing.yaml"], "'missing.yaml' cannot be read: No such file"),
     ],
 )

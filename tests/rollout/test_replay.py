@@ -96,6 +96,9 @@ def test_a_divergence_beyond_the_tolerance_is_the_exit_status(recorded, tmp_path
     [
         (["--dataset.root={}", "--mode=openloop"], "Did you mean 'open_loop'"),
         (["--dataset.root={}", *ROBOT, "--tolerance_m=1"], "tolerance_m and robot are both given"),
+        (["--dataset.root={}", *ROBOT, "--mode=state"], "mode and output_dir are of a replay in simulation"),
+        (["--dataset.root={}", *ROBOT, "--output_dir=x"], "mode and output_dir are of a replay in simulation"),
+        (["--dataset.root={}", "--gate.max_change=5"], "gate is set, and no robot"),
         (["--dataset.root={}", *ROBOT, "--gate.max_change=5"], "gate is of robots of other packages"),
         (["--dataset.root={}", "--dataset.episode=9"], "from 0 to 2"),
         ([], "No dataset is given; set --dataset.root=FOLDER"),

@@ -18,6 +18,7 @@ from bhd_lerobot.apps.doctor.checks import Finding, Status
 from bhd_lerobot.apps.doctor.trials import TIMEOUT_S, Outcome, run_trials
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Range, check_option
+from bhd_lerobot.options.terminal import Terminal
 
 _LEAST_POINTS = 1000  # or the 99th percentile rests on fewer than ten wake-ups
 _COLOURS = {Status.OK: "green", Status.WARNING: "yellow", Status.PROBLEM: "red"}
@@ -119,7 +120,7 @@ def examine_and_print(options: argparse.Namespace, run: RunTrials) -> int:
         from bhd_lerobot.datasets.format.identity import default_root
 
         root = default_root("bhd/doctor").parents[1]
-    console, measured = Console(), None
+    console, measured = Terminal(), None
     with Console(stderr=True).status("Checking this machine; half a minute …"):
         if options.realtime:
             _check_options(options.rate, options.seconds)

@@ -35,6 +35,9 @@ class RobotDescription:
     picture: Path = Path("robot.png")
     identify: bool = False
 
+    def __post_init__(self) -> None:
+        self.picture = self.picture.expanduser()
+
 
 def describe_robot(config: RobotDescription, console: Console) -> None:
     """Print what is understood of an arm, and write a picture of it.

@@ -48,7 +48,7 @@ class ViewedDataset:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._lock = threading.Lock()
-        self._packed: OrderedDict[tuple[str, int], bytes] = OrderedDict()
+        self._packed: OrderedDict[int, bytes] = OrderedDict()  # of the content
         self._content = self._read()
 
     def _read(self) -> _Content:
@@ -81,37 +81,42 @@ class ViewedDataset:
                 self._content = self._read()
                 self._packed.clear()
 
-    def _check_unchanged(self) -> None:
-        if stamp_of(self.root) != self._content.stamp:
+    def _unchanged(self, stamp: str | None) -> DatasetState:
+        """Return what was read if it is what is on disk, and what a page shows that was sent with this stamp.
+
+        Several pages may show the dataset, of which one has loaded it again and the others have not. To be called while
+        the lock is held.
+        """
+        content = self._content
+        if stamp_of(self.root) != content.stamp or stamp not in (None, content.stamp):
             raise DatasetError(
                 f"{self.root} has changed on disk since it was read, so an episode may have another number now. "
                 "Load it again."
             )
+        return content.state
 
     def summary(self) -> dict[str, Any]:
         """Return what the page knows of all episodes, column by column."""
         return self._content.summary
 
-    def packed(self, index: int) -> bytes:
+    def packed(self, index: int, stamp: str | None = None) -> bytes:
         """Return an episode as `packing` makes bytes of it; raise a `DatasetError` if it cannot be read as it was."""
-        content = self._content
-        key = (content.stamp, index)
         with self._lock:  # one reader at a time: two processors are not made faster by ten
-            self._check_unchanged()
-            if key in self._packed:
-                self._packed.move_to_end(key)
-                return self._packed[key]
-            row = row_of(content.state, index)
-            packed = packed_episode(content.state, row, _table(content.state, row))
-            self._packed[key] = packed
+            state = self._unchanged(stamp)
+            if index in self._packed:
+                self._packed.move_to_end(index)
+                return self._packed[index]
+            row = row_of(state, index)
+            packed = packed_episode(state, row, _table(state, row))
+            self._packed[index] = packed
             while sum(map(len, self._packed.values())) > _CACHED_BYTES and len(self._packed) > 1:
                 self._packed.popitem(last=False)
             return packed
 
-    def mark(self, index: int, wanted: Any) -> None:
+    def mark(self, index: int, wanted: Any, stamp: str | None = None) -> None:
         """Mark an episode, and read the dataset again; see `mark_episode`."""
         with self._lock:
-            self._check_unchanged()
+            self._unchanged(stamp)
             mark_episode(self.root, index, wanted)
             self._content = self._read()
             self._packed.clear()
@@ -127,12 +132,11 @@ class ViewedDataset:
         path = check_inside(self.root, self.root / layout.video_file(key, slot))
         return path if path.is_file() else None
 
-    def download(self, index: int, key: str | None) -> bytes | None:
+    def download(self, index: int, key: str | None, stamp: str | None = None) -> bytes | None:
         """Return an episode's numbers as CSV, or a camera's video of it as MP4; None if there is no such video."""
-        state = self.state
-        row = row_of(state, index)
         with self._lock:
-            self._check_unchanged()
+            state = self._unchanged(stamp)
+            row = row_of(state, index)
             if key is None:
                 return to_csv(state, _table(state, row))
             path = self.video(key, slot_of(row, f"videos/{key}")) if key in state.video_keys else None
@@ -141,15 +145,14 @@ class ViewedDataset:
             span = row[f"videos/{key}/from_timestamp"], row[f"videos/{key}/to_timestamp"]
             return to_video(path, span, row["length"], state.info["fps"])
 
-    def image(self, index: int, key: str, frame: int) -> bytes | None:
+    def image(self, index: int, key: str, frame: int, stamp: str | None = None) -> bytes | None:
         """Return the image of a camera whose images lie in the data files, or None if there is no such image."""
-        feature = self.state.info["features"].get(key)
-        row = row_of(self.state, index)
-        if feature is None or feature["dtype"] != "image" or not 0 <= frame < row["length"]:
-            return None
         with self._lock:
-            self._check_unchanged()
-            stored = episode_frames(self.state, row, [key])[key][frame].as_py() or {}
+            state = self._unchanged(stamp)
+            feature, row = state.info["features"].get(key), row_of(state, index)
+            if feature is None or feature["dtype"] != "image" or not 0 <= frame < row["length"]:
+                return None
+            stored = episode_frames(state, row, [key])[key][frame].as_py() or {}
         if stored.get("bytes"):
             return bytes(stored["bytes"])
         if not stored.get("path"):

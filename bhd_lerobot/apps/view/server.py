@@ -151,7 +151,7 @@ async def _episode(request: web.Request) -> web.Response:
     etag = f'"{dataset.stamp}-{request.app[_TOKEN][:8]}"'  # another server's packing may be another one
     if request.headers.get("If-None-Match") == etag:
         return web.Response(status=304, headers={"ETag": etag})
-    packed = await asyncio.to_thread(dataset.packed, _number(request, "index"))
+    packed = await asyncio.to_thread(dataset.packed, _number(request, "index"), _shown(request))
     return web.Response(body=packed, content_type="application/octet-stream", headers={"ETag": etag})
 
 
@@ -165,7 +165,7 @@ async def _video(request: web.Request) -> web.StreamResponse:
 
 async def _download(request: web.Request) -> web.Response:
     dataset, index, key = request.app[_DATASET], _number(request, "index"), request.match_info.get("key")
-    content = await asyncio.to_thread(dataset.download, index, key)
+    content = await asyncio.to_thread(dataset.download, index, key, _shown(request))
     if content is None:
         raise web.HTTPNotFound(text="There is no such video.\n")
     kind = "text/csv" if key is None else "video/mp4"
@@ -174,7 +174,8 @@ async def _download(request: web.Request) -> web.Response:
 
 async def _image(request: web.Request) -> web.Response:
     dataset, key = request.app[_DATASET], request.match_info["key"]
-    content = await asyncio.to_thread(dataset.image, _number(request, "index"), key, _number(request, "frame"))
+    index, frame = _number(request, "index"), _number(request, "frame")
+    content = await asyncio.to_thread(dataset.image, index, key, frame, _shown(request))
     if content is None:
         raise web.HTTPNotFound(text="There is no such image.\n")
     kind = "image/png" if content.startswith(b"\x89PNG") else "image/jpeg"
@@ -187,8 +188,13 @@ async def _mark(request: web.Request) -> web.Response:
         wanted = await request.json()
     except ValueError as error:
         raise web.HTTPBadRequest(text=f"The request is not JSON: {error}\n") from error
-    await asyncio.to_thread(dataset.mark, index, wanted)
+    await asyncio.to_thread(dataset.mark, index, wanted, _shown(request))
     return web.json_response({"stamp": dataset.stamp})
+
+
+def _shown(request: web.Request) -> str | None:
+    """Return the stamp of what the asking page shows; None if it does not say so."""
+    return request.query.get("stamp")
 
 
 def _number(request: web.Request, name: str) -> int:

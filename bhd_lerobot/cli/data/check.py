@@ -11,13 +11,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from bhd_lerobot.bodies.registry import body_of
-from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
+from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import is_being_written
 from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.validate.dataset import CHECKS, DatasetCheck, Severity, check_dataset
 from bhd_lerobot.datasets.validate.values import Limits
 from bhd_lerobot.errors import DatasetLockedError, counted
+from bhd_lerobot.options.terminal import Terminal
 
 # No option of a robot changes its limits, and its configuration takes seconds to import.
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow", Severity.NOTE: "dim"}
@@ -69,7 +70,7 @@ def limits_of(robot_type: str | None) -> Limits:
 
 def _print(found: DatasetCheck, console: Console, is_valid: bool) -> None:
     if found.findings:
-        table = Table(title=str(found.root), title_justify="left")
+        table = Table(title=escape(str(found.root)), title_justify="left")
         for heading in ("", "check", "where", "what"):
             table.add_column(heading, overflow="fold")
         for finding in found.findings:
@@ -79,7 +80,7 @@ def _print(found: DatasetCheck, console: Console, is_valid: bool) -> None:
         console.print(table)
     errors, warnings = found.count(Severity.ERROR), found.count(Severity.WARNING)
     console.print(
-        f"{found.root}: {counted(found.episodes, 'episode')}, {counted(found.frames, 'frame')}: "
+        f"{escape(str(found.root))}: {counted(found.episodes, 'episode')}, {counted(found.frames, 'frame')}: "
         f"{'valid' if is_valid else 'not valid'}, {_some(errors, 'error')}, {_some(warnings, 'warning')}.",
         soft_wrap=True,
         highlight=False,

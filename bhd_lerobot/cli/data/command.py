@@ -4,8 +4,6 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from rich.console import Console
-
 from bhd_lerobot.datasets.format.identity import default_root
 
 type Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -13,14 +11,6 @@ type Commands = argparse._SubParsersAction[argparse.ArgumentParser]
 
 type Run = Callable[[argparse.Namespace], int]
 """Carries a command out and returns the exit status."""
-
-
-class Terminal(Console):
-    """Where a command prints. The program handles a pipe that is read no longer, as of ``| head -1``."""
-
-    def on_broken_pipe(self) -> None:
-        """Do not end with status 1, which has another meaning for some commands."""
-        raise BrokenPipeError
 
 
 def add_command(

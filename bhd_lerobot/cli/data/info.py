@@ -13,12 +13,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, roots_of
+from bhd_lerobot.cli.data.command import Commands, add_command, roots_of
 from bhd_lerobot.cli.data.episode_list import short as ranges
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info, is_being_written
 from bhd_lerobot.datasets.timing import grants_of, ms, timing_of
 from bhd_lerobot.errors import DatasetError, counted
+from bhd_lerobot.options.terminal import Terminal
 from bhd_lerobot.realtime.timing import TimingSummary
 
 

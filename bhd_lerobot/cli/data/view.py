@@ -7,8 +7,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from bhd_lerobot.cli.data.command import Commands, Terminal, add_command, root_of
+from bhd_lerobot.cli.data.command import Commands, add_command, root_of
 from bhd_lerobot.errors import ConfigError, counted
+from bhd_lerobot.options.terminal import Terminal
 
 PORT = 8766
 

@@ -13,9 +13,11 @@ import pytest
 
 from bhd_lerobot.apps.doctor import checks, latency_test, trials
 from bhd_lerobot.apps.doctor.checks import ROWS, Finding, Status
+from bhd_lerobot.apps.doctor.robot import RobotDescription
 from bhd_lerobot.apps.doctor.trials import Outcome, run_trials
 from bhd_lerobot.cli.doctor import main
 from bhd_lerobot.realtime.privileges import GRANT_BANDWIDTH
+from bhd_lerobot.robots.config_arm import SO101Config
 from tests.cases import each_case
 from tests.forks import Fork
 
@@ -454,3 +456,7 @@ def test_a_picture_of_a_robot_that_cannot_be_written_is_named(name: str, tmp_pat
     (tmp_path / "folder").mkdir()
     assert main(["--robot.type=so101", f"--picture={tmp_path / name}"]) == 2
     assert re.search(r"picture is .*, which cannot be written", " ".join(capsys.readouterr().err.split()))
+
+
+def test_a_picture_is_written_into_the_folder_of_the_user() -> None:
+    assert RobotDescription(SO101Config(), Path("~/robot.png")).picture == Path.home() / "robot.png"

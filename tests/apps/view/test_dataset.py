@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from bhd_lerobot.apps.view.dataset import ViewedDataset
+from bhd_lerobot.apps.view.guard import TOKEN_HEADER
+from bhd_lerobot.datasets.edit.edits import delete
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.errors import DatasetCorruptError, DatasetError, DatasetLockedError
 from tests.apps.view.support import served
@@ -36,6 +38,20 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
             status, content = server.mark(0, {"outcome": "success"})
         assert status == 409
         assert "being recorded, repaired or edited" in content.decode()
+
+
+def test_a_page_that_shows_what_another_page_has_loaded_again_is_refused(tmp_path) -> None:
+    """Its numbers are those of other episodes."""
+    root = record_ours(tmp_path / "d", 3)
+    with served(root) as server:
+        old = server.json("/api/dataset")["stamp"]
+        delete(root, [0])
+        new = server.json("/api/dataset")["stamp"]
+        mark = {"method": "POST", "body": {"outcome": "success"}, "headers": {TOKEN_HEADER: server.token()}}
+        for path, more in (("", {}), ("/episode.csv", {}), ("/mark", mark)):
+            status, _, content = server.ask(f"/api/episodes/0{path}?stamp={old}", **more)
+            assert (status, b"has changed on disk" in content) == (409, True), path
+            assert server.ask(f"/api/episodes/0{path}?stamp={new}", **more)[0] == 200, path
 
 
 def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.apps.view.packing import unpack
+from bhd_lerobot.datasets.edit.edits import delete
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from tests.apps.browser import ARGUMENTS, found_browser, opened, wait_until
 from tests.apps.view.support import Served, served
@@ -277,6 +278,19 @@ def test_changes_on_disk_are_reported(browser, base, tmp_path) -> None:
         page.wait_for_selector("#banner", state="hidden")
         assert page.get_attribute(".card-a", "data-episode") == "2"
         page.wrong[:] = [text for text in page.wrong if "409" not in text]  # the browser's own line on the refusal
+
+
+def test_a_page_marks_nothing_once_another_has_loaded_the_changed_dataset(browser, base, tmp_path) -> None:
+    root = Path(shutil.copytree(base, tmp_path / "d"))
+    with served(root) as server, opened(browser, server.url) as page:
+        select(page, 1)
+        page.click("#mark-success")
+        delete(root, [0])
+        outcomes = server.json("/api/dataset")["episodes"]["outcome"]  # as the other page
+        page.click("#mark-send")
+        page.wait_for_selector("#toast.bad:has-text('has changed')")
+        assert server.json("/api/dataset")["episodes"]["outcome"] == outcomes
+        page.wrong[:] = [text for text in page.wrong if "409" not in text]
 
 
 def test_a_missing_video_is_reported_in_its_place(browser, base, tmp_path) -> None:

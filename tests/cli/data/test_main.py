@@ -64,6 +64,8 @@ def test_info_of_several_datasets(recorded, tmp_path, capsys):
     assert "does not exist" in captured.err
     assert main.main(["info", "--json", str(recorded), str(other)]) == 0
     assert [one["root"] for one in json.loads(capsys.readouterr().out)] == [str(recorded), str(other)]
+    assert main.main(["check", str(other)]) == 0
+    assert f"{other}: 1 episode, 30 frames: valid" in capsys.readouterr().out
     assert main.main(["info", str(other), str(recorded)]) == 0
     output = capsys.readouterr().out
     assert str(other) in output.replace("\n", "")

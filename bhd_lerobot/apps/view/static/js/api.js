@@ -30,7 +30,7 @@ export async function loadStamp() {
 
 export function loadEpisode(index, stamp) {
   const key = `${index} ${stamp}`;
-  const known = episodes.get(key) ?? ask(`/api/episodes/${index}`).then((r) => r.arrayBuffer()).then(unpack);
+  const known = episodes.get(key) ?? ask(`/api/episodes/${index}?stamp=${stamp}`).then((r) => r.arrayBuffer()).then(unpack);
   episodes.delete(key);
   episodes.set(key, known); // the newest is last
   if (episodes.size > KEPT) episodes.delete(episodes.keys().next().value);
@@ -38,9 +38,10 @@ export function loadEpisode(index, stamp) {
   return known;
 }
 
-export async function mark(index, what) {
+// An episode may have another number once the dataset has changed: the stamp says which dataset the page shows.
+export async function mark(index, what, stamp) {
   const headers = { "Content-Type": "application/json", "X-Bhd-Token": token };
-  return (await ask(`/api/episodes/${index}/mark`, { method: "POST", headers, body: JSON.stringify(what) })).json();
+  return (await ask(`/api/episodes/${index}/mark?stamp=${stamp}`, { method: "POST", headers, body: JSON.stringify(what) })).json();
 }
 
 const TYPES = { float32: Float32Array, float64: Float64Array, uint8: Uint8Array, int32: Int32Array };

@@ -17,11 +17,11 @@ export function markButtons() {
     }, "intervention…"));
 }
 
-async function send(index, what, words) {
+async function send(index, what, words, stamp) {
   const buttons = () => document.querySelectorAll(".marks button");
   for (const button of buttons()) button.disabled = true;
   try {
-    await mark(index, what);
+    await mark(index, what, stamp);
     toast(`Episode ${index} ${words}.`);
   } catch (error) {
     toast(error.message, true);
@@ -31,7 +31,7 @@ async function send(index, what, words) {
 
 // Ask in a dialog; `read` turns the form into a mark and the words for it.
 function ask(title, fields, read) {
-  const dialog = byId("dialog"), index = state.a.index;
+  const dialog = byId("dialog"), { index } = state.a, { stamp } = state.dataset;
   const form = make("form", {
     method: "dialog",
     onsubmit: (event) => {
@@ -39,7 +39,7 @@ function ask(title, fields, read) {
       event.preventDefault();
       dialog.close();
       const content = new FormData(form), [what, words] = read(content);
-      send(index, { ...what, note: content.get("note").trim() }, words);
+      send(index, { ...what, note: content.get("note").trim() }, words, stamp);
     },
   },
   make("h2", {}, title),
