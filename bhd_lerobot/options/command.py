@@ -109,13 +109,15 @@ def run(
         load_plugins()
         given = load_named(sys.argv[1:] if arguments is None else arguments)
         left = [argument for argument in given if argument not in ("-h", "--help")]
+        choose = (lambda _: program) if isinstance(program, Program) else program
         try:
             line = read_line(left, command)
+            chosen = choose(line)
         except ConfigError:
             if left == given:
                 raise
             line = CommandLine({})  # help is printed whatever else is missing or wrong
-        chosen = program if isinstance(program, Program) else program(line)
+            chosen = choose(line)
         interrupted = chosen.interrupted
         if left != given:
             types = re.findall(r"^--([\w.]+\.type)[=\n](\S+)$", "\n".join(left), re.MULTILINE)

@@ -107,7 +107,7 @@ def draw_panel(axes: Axes, trajectory: Trajectory) -> None:
     # The font has no Chinese characters.
     if isinstance(trajectory.scene, TableScene) and trajectory.instruction.isascii():
         title = f"{title}\n{textwrap.shorten(trajectory.instruction, 44, placeholder=' …')}".rstrip()
-    axes.set_title(title, fontsize=7.5, color=color)
+    axes.set_title(title, fontsize=7.5, color=color, parse_math=False)  # an instruction may be about dollars
     _draw_scale(axes)
 
 

@@ -107,12 +107,17 @@ def test_errors_of_this_package_are_messages_and_others_keep_their_traceback(cap
 
 def test_help_is_that_of_what_the_command_line_chooses_whatever_else_is_wrong_with_it(capsys):
     def choose(line):
-        return Program(RlConfig if "algorithm" in line.options else RecordConfig, lambda _: pytest.fail("it ran"))
+        kind = RlConfig if "algorithm" in {**line.options, **line.file} else RecordConfig
+        return Program(kind, lambda _: pytest.fail("it ran"))
 
-    for given, option in ((["--algorithm=ppo", "--help"], "--ppo.lr"), (["-h", "--robot.type=ur5", "x"], "--robot.id")):
+    for given, option in (
+        (["--algorithm=ppo", "--help"], "--ppo.lr"),
+        (["-h", "--robot.type=ur5", "x"], "--robot.id"),
+        (["--config_path=missing.yaml", "--help"], "--dataset.num_episodes"),
+    ):
         assert run(choose, given) == 0
         assert option in capsys.readouterr().out
-    assert run(choose, ["x"]) == 2
+    assert run(choose, ["x"]) == run(choose, ["--config_path=missing.yaml"]) == 2
 
 
 @each_case(

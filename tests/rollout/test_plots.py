@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arenas import make_arena
+from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.rollout import plots
 
 pytestmark = pytest.mark.figures
@@ -24,3 +25,10 @@ def test_of_many_episodes_the_failures_are_shown_before_others(tmp_path, monkeyp
     monkeypatch.setattr(plots, "draw_trajectories", lambda trajectories, path, heading: headings.append(heading))
     album.draw(tmp_path / "t.png", "20 episodes")
     assert headings == ["20 episodes; 5 of them, failures before others"]
+
+
+def test_an_instruction_about_dollars_is_text(tmp_path):
+    scene = TableScene("empty", (), ())
+    one = plots.Trajectory("0", scene, np.array([[0.3, 0.0], [0.4, 0.1]]), None, "put the $5 & the $6 note down")
+    plots.draw_trajectories([one], tmp_path / "t.png", "one")
+    assert (tmp_path / "t.png").is_file()

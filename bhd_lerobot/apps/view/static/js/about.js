@@ -47,8 +47,8 @@ function stored(episode) {
 function showDownloads(episode) {
   const dialog = byId("dialog"), path = `/api/episodes/${episode.index}`;
   const name = `${state.dataset.name}-episode-${episode.index}`;
-  const { stamp } = state.dataset;
-  const link = (href, file, what) => make("p", {}, make("a", { href: `${href}?stamp=${stamp}`, download: file }, file), ` ${what}`);
+  const link = (href, file, what) =>
+    make("p", {}, make("a", { href: `${href}?stamp=${episode.stamp}`, download: file }, file), ` ${what}`);
   const videos = episode.videos.filter(({ kind }) => kind === "video").map(({ key }) => {
     const { label } = state.dataset.cameras.find((camera) => camera.key === key);
     return link(`${path}/videos/${encodeURIComponent(key)}.mp4`, `${name}-${label.replaceAll(/[^\w-]/g, "_")}.mp4`, "the video, not encoded again");

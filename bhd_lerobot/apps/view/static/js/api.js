@@ -30,7 +30,8 @@ export async function loadStamp() {
 
 export function loadEpisode(index, stamp) {
   const key = `${index} ${stamp}`;
-  const known = episodes.get(key) ?? ask(`/api/episodes/${index}?stamp=${stamp}`).then((r) => r.arrayBuffer()).then(unpack);
+  const known = episodes.get(key) ?? ask(`/api/episodes/${index}?stamp=${stamp}`)
+    .then((response) => response.arrayBuffer()).then((buffer) => ({ ...unpack(buffer), stamp }));
   episodes.delete(key);
   episodes.set(key, known); // the newest is last
   if (episodes.size > KEPT) episodes.delete(episodes.keys().next().value);
@@ -38,8 +39,8 @@ export function loadEpisode(index, stamp) {
   return known;
 }
 
-// An episode may have another number once the dataset has changed: the stamp says which dataset the page shows.
-export async function mark(index, what, stamp) {
+// Once the dataset has changed, the number may be another episode's: the stamp says which dataset is shown.
+export async function mark({ index, stamp }, what) {
   const headers = { "Content-Type": "application/json", "X-Bhd-Token": token };
   return (await ask(`/api/episodes/${index}/mark?stamp=${stamp}`, { method: "POST", headers, body: JSON.stringify(what) })).json();
 }

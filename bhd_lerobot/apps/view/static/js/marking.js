@@ -17,21 +17,21 @@ export function markButtons() {
     }, "intervention…"));
 }
 
-async function send(index, what, words, stamp) {
+async function send(episode, what, words) {
   const buttons = () => document.querySelectorAll(".marks button");
   for (const button of buttons()) button.disabled = true;
   try {
-    await mark(index, what, stamp);
-    toast(`Episode ${index} ${words}.`);
+    await mark(episode, what);
+    toast(`Episode ${episode.index} ${words}.`);
   } catch (error) {
     toast(error.message, true);
   }
-  emit("marked", index); // also where it failed: the dataset may be another one now
+  emit("marked", episode.index); // also where it failed: the dataset may be another one now
 }
 
 // Ask in a dialog; `read` turns the form into a mark and the words for it.
 function ask(title, fields, read) {
-  const dialog = byId("dialog"), { index } = state.a, { stamp } = state.dataset;
+  const dialog = byId("dialog"), episode = state.a;
   const form = make("form", {
     method: "dialog",
     onsubmit: (event) => {
@@ -39,7 +39,7 @@ function ask(title, fields, read) {
       event.preventDefault();
       dialog.close();
       const content = new FormData(form), [what, words] = read(content);
-      send(index, { ...what, note: content.get("note").trim() }, words, stamp);
+      send(episode, { ...what, note: content.get("note").trim() }, words);
     },
   },
   make("h2", {}, title),

@@ -78,7 +78,7 @@ function images(camera, episode) {
     isLoading = true;
     loaded = frame;
     element.dataset.frame = frame;
-    element.src = `/api/episodes/${episode.index}/images/${encodeURIComponent(camera.key)}/${frame}?stamp=${state.dataset.stamp}`;
+    element.src = `/api/episodes/${episode.index}/images/${encodeURIComponent(camera.key)}/${frame}?stamp=${episode.stamp}`;
   }
   return { element: make("div", { class: "video" }, element, problem), show };
 }
