@@ -51,6 +51,14 @@ _Loader.yaml_implicit_resolvers = {
 }
 
 
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping of a JSON file; raise if it has a key twice."""
+    keys = [key for key, _ in pairs]
+    for key in (key for key in keys if keys.count(key) > 1):
+        raise ValueError(f"the key {key!r} occurs twice in a mapping; leave one of them")
+    return dict(pairs)
+
+
 @dataclasses.dataclass
 class CommandLine:
     """What a command line says, read once.
@@ -171,16 +179,16 @@ def encode(config: Any) -> dict[str, Any]:
 
 def read_file(path: Path) -> dict[str, Any]:
     """Return what a YAML or JSON file holds."""
+    is_json = path.suffix == ".json"  # JSON's 1e-05 is text in YAML
     try:
         text = path.read_text(encoding="utf-8")
-        # JSON's 1e-05 is text in YAML.
-        values = json.loads(text) if path.suffix == ".json" else yaml.load(text, _Loader)
+        values = json.loads(text, object_pairs_hook=_unique) if is_json else yaml.load(text, _Loader)
     except OSError as error:
         raise ConfigError(
             f"The configuration {str(path)!r} cannot be read: {error.strerror}. Give --config_path a YAML or JSON file."
         ) from error
     except (yaml.YAMLError, ValueError) as error:
-        kind = "JSON" if path.suffix == ".json" else "YAML"
+        kind = "JSON" if is_json else "YAML"
         raise ConfigError(f"{path} is not a {kind} file: {' '.join(str(error).split())}") from error
     if not isinstance(values, dict):
         found = "nothing" if values is None else type(values).__name__

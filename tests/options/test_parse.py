@@ -135,6 +135,7 @@ def test_help_is_that_of_what_the_command_line_chooses_whatever_else_is_wrong_wi
         ("a.yaml", b"\xff\xfe\x00", "is not a YAML file"),
         ("a.yaml", b"\x00", "is not a YAML file"),
         ("a.json", b"{", "is not a JSON file"),
+        ("a.json", b'{"robot": {"type": "ur5", "type": "ur3e"}}', "'type' occurs twice"),
     ],
 )
 def test_files_that_are_no_configuration(tmp_path, name, content, message):
