@@ -91,7 +91,7 @@ def _overview(summary: DatasetSummary) -> str:
             rows.append((part, str(chosen.get("type") or chosen.get("name") or "")))
     cameras = [key for key, feature in summary.features.items() if feature["dtype"] in ("video", "image")]
     rows.append(("cameras", ", ".join(f"`{key}`" for key in cameras) or "none"))
-    shown = [_cell(task) for task in summary.tasks[:10]]
+    shown = summary.tasks[:10]
     more = f", and {len(summary.tasks) - 10} more" if len(summary.tasks) > 10 else ""
     rows.append(("instructions" if len(summary.tasks) > 1 else "instruction", "; ".join(shown) + more))
     rows.append(("size", f"{summary.size / 1e6:.1f} MB in {counted(summary.files, 'file')}"))

@@ -16,11 +16,14 @@ import yaml
 from bhd_lerobot.cli import record as record_module
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.cli.data.check import limits_of
+from bhd_lerobot.datasets.format.state import load_state
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.remote.push import is_generated
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import TransferError
 from bhd_lerobot.evaluation.statistics import wilson
+from bhd_lerobot.hub.card import CardOptions, make_card
+from tests.datasets import support
 from tests.datasets.support import snapshot as content
 from tests.fake_hub.hub import FakeHub, Fault, real_client
 from tests.forks import Fork
@@ -107,6 +110,15 @@ def test_the_card_says_what_is_in_the_dataset(hub: FakeHub, recorded: Path) -> N
     image = imread(Path(os.environ["HF_HOME"]) / "p.png")
     assert image.shape[0] > 200
     assert image[..., :3].std() > 0.05
+
+
+def test_an_instruction_is_one_cell_of_the_card(tmp_path: Path) -> None:
+    with support.create(tmp_path / "d") as recorder:
+        writer = support.fill(recorder.begin_episode(), 0)
+        recorder.save(writer, task="open the <left|right> door", metadata=support.metadata(0))
+        recorder.finalize()
+    card = make_card(load_state(tmp_path / "d"), CardOptions("me/d"), has_image=True).text
+    assert "| instruction | open the &lt;left\\|right> door |" in card
 
 
 @pytest.mark.figures
