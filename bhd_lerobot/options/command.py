@@ -49,10 +49,12 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
     except BrokenPipeError:
         if not _is_unread():
             raise
+        _give_output_up()
         return 128 + signal.SIGPIPE
     except OSError as error:
         if error.errno not in _REMEDIES:
             raise
+        _give_output_up()
         where = error.filename2 or error.filename
         print(f"error: {error.strerror}{f': {where}' if where else ''}. {_REMEDIES[error.errno]}", file=sys.stderr)
         return FAILED
@@ -67,15 +69,21 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
 
 
 def _is_unread() -> bool:
-    """Return whether nothing reads standard output any more; then Python does not try to write it when it ends."""
+    """Return whether nothing reads standard output any more."""
     if sys.stdout is None:
         return False
     poll = select.poll()
     poll.register(sys.stdout, 0)
-    if not any(events & select.POLLERR for _, events in poll.poll(0)):
-        return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return True
+    return any(events & select.POLLERR for _, events in poll.poll(0))
+
+
+def _give_output_up() -> None:
+    """Let Python not try again, when it ends, to write what standard output does not take."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @dataclass(frozen=True)

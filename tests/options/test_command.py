@@ -1,6 +1,7 @@
 import errno
 import logging
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -38,3 +39,11 @@ def test_a_folder_of_nobody_is_a_message_and_other_errors_keep_their_traceback(c
     assert "A path begins with ~ and the name of no user" in capsys.readouterr().err
     with pytest.raises(FileNotFoundError):
         exit_status(lambda: Path("there/is/none").stat().st_size)
+
+
+def test_a_full_disk_behind_standard_output_is_a_message_and_status_2(monkeypatch, capsys):
+    with open("/dev/full", "w") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        assert exit_status(lambda: print("text")) == 2
+        output.flush()  # as Python does when it ends
+    assert "No space left on device. Make room there" in capsys.readouterr().err

@@ -116,8 +116,9 @@ def stamp(message):
 
 
 @pytest.mark.parametrize("compressed", [[], ["--compressed_images"]])
-def test_texts_and_images_of_an_unknown_robot(toy, tmp_path, compressed):
-    bags = export(toy, tmp_path / "bags", *compressed)
+def test_texts_and_images_of_an_unknown_robot(toy, tmp_path, capsys, compressed):
+    bags = export(toy, tmp_path / "my bags", *compressed)
+    assert f"Play one: ros2 bag play '{bags}/episode_000000'" in capsys.readouterr().out
     topics = decoded(bags / "episode_000001/episode_000001.mcap")
     assert "/bhd/observation_state" in topics
     assert [message.text for _, message in topics["/bhd/note"]] == [f"1/{k}" for k in range(support.length(1))]
