@@ -11,7 +11,9 @@ from collections.abc import Iterable
 
 
 class BhdError(Exception):
-    """Base class of everything this package raises on purpose."""
+    """Base class of everything this package raises on purpose; `exit_status`: that of a program which it ends."""
+
+    exit_status = 2
 
 
 class ConfigError(BhdError, ValueError):

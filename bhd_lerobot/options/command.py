@@ -20,7 +20,7 @@ from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
 if TYPE_CHECKING:
     from bhd_lerobot.options.parse import CommandLine
 
-FAILED = 2
+FAILED = BhdError.exit_status
 """The exit status after an error with a message."""
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -45,7 +45,7 @@ def exit_status(program: Callable[[], int | None], interrupted: str | Callable[[
                 sys.stdout.flush()  # a pipe that nothing reads shows now, not when Python ends
     except BhdError as error:
         print("\n  ".join([f"error: {error}", *getattr(error, "__notes__", ())]), file=sys.stderr)
-        return FAILED
+        return error.exit_status
     except BrokenPipeError:
         if not _is_unread():
             raise

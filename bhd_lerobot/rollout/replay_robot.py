@@ -78,11 +78,13 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
         seen = []
         for action in actions:
             seen.append(robots.observe().state[0])
-            report = robots.step(action[None])
+            report = robots.step(None if stop else action[None])
             mode = Mode(int(report.mode[0]))
             if mode in (Mode.ESTOP, Mode.FAULT) or stop:
                 why = robots.problem or ", ".join(pressed.causes) or stop.name or mode.name
-                raise RealtimeError(f"The robot was stopped after {len(seen)} of {len(actions)} frames: {why}.")
+                stopped = RealtimeError(f"The robot was stopped after {len(seen)} of {len(actions)} frames: {why}.")
+                stopped.exit_status = stop.exit_status or stopped.exit_status
+                raise stopped
         robots.stop(only)
     seen_by_name = dict(zip(robots.observation_names, np.array(seen).T, strict=True))
     both = {name: (seen_by_name[name], values) for name, values in observed.items() if name in seen_by_name}

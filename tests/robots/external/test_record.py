@@ -212,21 +212,22 @@ def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) ->
     assert len(np.loadtxt(tmp_path / "log")) == len(sent)
 
 
+@pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_a_press_while_a_replay_connects_its_robot_moves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     run(tmp_path / "d", dataset__num_episodes=1)
     connect = MockArm.connect
 
     def pressed(self: MockArm, calibrate: bool = True) -> None:
-        os.kill(os.getpid(), signal.SIGUSR1)
+        os.kill(os.getpid(), number)
         connect(self)
 
     before = signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # as a command that starts leaves it to nobody
     try:
         monkeypatch.setattr(MockArm, "connect", pressed)
         robot = parse(RecordConfig, options(tmp_path / "other", robot__log=tmp_path / "log")).robot
-        with pytest.raises(RealtimeError, match=r"stopped after .* frames: signal SIGUSR1"):
+        with pytest.raises(RealtimeError, match=f"stopped after .* frames: .*{number.name}"):
             replay_on_robot(tmp_path / "d", 0, robot, GateConfig(max_change=90.0), Console(file=io.StringIO()))
     finally:
         signal.signal(signal.SIGUSR1, before)
@@ -296,8 +297,9 @@ def test_a_signal_ends_a_replay_and_lets_go_of_the_robot(
     monkeypatch.setattr(MockArm, "send_action", interrupted)
     monkeypatch.setattr(MockArm, "disconnect", let_go)
     console = Console(file=io.StringIO(), width=120)
-    with pytest.raises(RealtimeError, match=rf"stopped after \d+ of \d+ frames: {number.name}"):
+    with pytest.raises(RealtimeError, match=rf"stopped after \d+ of \d+ frames: {number.name}") as stopped:
         replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=50.0), console)
+    assert stopped.value.exit_status == 128 + number
     assert ended
     assert ended[0] < 15
 
