@@ -12,10 +12,13 @@ from tests.forks import Fork
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 # Something that the output has to contain, because it is what the tutorial is about.
 SHOWN = {
-    "record_and_look": ["400 frames in 4 episodes", "valid, no errors", "identical in 100 frames"],
+    "record_and_look": [
+        *("Look at it with: bhd-data view data/first", "400 frames in 4 episodes", "valid, no errors"),
+        "identical in 100 frames",
+    ],
     "train_and_evaluate": [" of 3 episodes succeeded", "step   20", "difference: "],
     "cameras": ["12 tables in", "chose an object: ", "rule: 2 of 2"],
-    "from_a_ros2_bag": ["control.applied_action", "valid, no errors"],
+    "from_a_ros2_bag": ["Look at it with: bhd-data view data/drives", "control.applied_action", "valid, no errors"],
     "from_the_articles": [
         *("valid, no errors", "Hz; interval: mean", " messages in ", " messages published"),
         *("test_move_001 True", "test_move_002 False"),
