@@ -140,7 +140,7 @@ def test_a_robot_is_made_of_its_type_or_a_dictionary_also_one_of_lerobot(monkeyp
     assert bhd.make_brain({"type": "gap_follower", "margin_m": 0.1}).config.margin_m == 0.1
     with pytest.raises(bhd.BhdError, match="Did you mean 'so101_follower'"):
         bhd.make_robot("so101_folower")
-    with pytest.raises(bhd.BhdError, match="Did you mean 'robot.beams'"):
+    with pytest.raises(bhd.BhdError, match=r"Did you mean 'robot\.beams'"):
         bhd.make_robot("turtlebot3", beens=36)
 
 

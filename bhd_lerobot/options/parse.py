@@ -95,8 +95,8 @@ class CommandLine:
                 inner = inner[key]
                 if not isinstance(inner, dict):
                     raise ConfigError(
-                        f"Option --{name} sets a key of {key!r}, which is {inner!r}. If that is its type, write it as a "
-                        "key, too: type."
+                        f"Option --{name} sets a key of {key!r}, which is {inner!r}. If that is its type, write it "
+                        "as a key, too: type."
                     )
             inner[last] = value
         return result
