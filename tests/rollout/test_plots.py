@@ -29,6 +29,6 @@ def test_of_many_episodes_the_failures_are_shown_before_others(tmp_path, monkeyp
 
 def test_an_instruction_about_dollars_is_text(tmp_path):
     scene = TableScene("empty", (), ())
-    one = plots.Trajectory("0", scene, np.array([[0.3, 0.0], [0.4, 0.1]]), None, "put the $5 & the $6 note down")
+    one = plots.Trajectory("0", scene, np.array([[0.3, 0.0], [0.4, 0.1]]), None, "put the $5 # note beside the $6 note")
     plots.draw_trajectories([one], tmp_path / "t.png", "one")
     assert (tmp_path / "t.png").is_file()
