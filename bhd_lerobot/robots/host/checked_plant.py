@@ -158,8 +158,9 @@ class CheckedPlant(Plant):
             for values in (reading.position, reading.velocity, reading.effort, reading.sensors)
         ):
             return "it reads what is not a finite number"
-        status = SafetyStatus(int(reading.safety[0]))
-        return "" if status == SafetyStatus.NORMAL else f"its safety status is {status.name}"
+        status = int(reading.safety[0])
+        named = SafetyStatus(status).name if status in SafetyStatus else f"{status}, which is no SafetyStatus"
+        return "" if status == SafetyStatus.NORMAL else f"its safety status is {named}"
 
     def _leave_a_stop(self, reading: PlantReading) -> bool:
         """Ask the robot to leave a stop of its own; return False if it is in none."""

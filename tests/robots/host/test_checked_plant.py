@@ -152,6 +152,10 @@ def wrong_shape(out: PlantReading) -> None:
     out.position[0] = np.zeros(3)
 
 
+def a_code_of_its_own(out: PlantReading) -> None:
+    out.safety[0] = 9
+
+
 @pytest.mark.law
 @each_case(
     "call, how",
@@ -161,6 +165,7 @@ def wrong_shape(out: PlantReading) -> None:
         ("read", no_stamp),
         ("read", ten_seconds_ahead),
         ("read", wrong_shape),
+        ("read", a_code_of_its_own),
         ("write", boom),
         ("set_mode", boom),
     ],
@@ -220,6 +225,7 @@ def test_the_robots_own_safety_functions_are_heard_and_a_reset_starts_from_where
     [
         (lambda plant: plant.broken.update(read=no_stamp), "has read nothing yet"),
         (lambda plant: setattr(plant, "safety", SafetyStatus.STOPPED), "its safety status is STOPPED"),
+        (lambda plant: setattr(plant, "safety", 9), "its safety status is 9, which is no SafetyStatus"),
         (lambda plant: plant.broken.update(read=not_a_number), "not a finite number"),
         (lambda plant: plant.broken.update(read=ten_seconds_ahead), "a stamp is 10.000 s ahead of now"),
         (lambda plant: plant.broken.update(read=boom), "OSError: the cable is out"),
