@@ -13,6 +13,7 @@ _DATASETS = ("datasets.format", "datasets.storage")
 ARROWS: dict[str, tuple[str, ...]] = {
     "errors": (),
     "versions": (),
+    "programs": (),
     "stock": (),
     "options": (),
     "bodies": ("options",),
@@ -32,12 +33,12 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "tasks": _TASKS,
     "robots.host": (
         *("bodies.body", "bodies.scenes", "bodies.tabletop", "bodies.truth", "robots.parts"),
-        *("sim", "control.*", "realtime", "datasets.format", "ros2.live.network"),
+        *("sim", "control.*", "realtime", "datasets.format", "ros2.live.network", "programs"),
     ),
     "robots.parts": ("bodies.body", "bodies.arenas", "bodies.tabletop", "sim", "control.*"),
-    "robots.viewer": ("bodies.scenes", "realtime", "robots.host", "sim.window"),
+    "robots.viewer": ("programs", "bodies.scenes", "realtime", "robots.host", "sim.window"),
     "robots.external": ("realtime", "options", "bodies.body", "control", "datasets.format", "robots.host"),
-    "robots.device": ("options", "bodies.body", "control", "control.geometry", "robots.external"),
+    "robots.device": ("programs", "options", "bodies.body", "control", "control.geometry", "robots.external"),
     "robots": (
         "options",
         "realtime",
@@ -77,12 +78,12 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.edit": ("options", *_DATASETS, "datasets.assembly", "bodies", "tasks"),
     "datasets.validate": (*_DATASETS, "control.geometry"),
     "datasets.recovery": (*_DATASETS, "datasets.assembly", "datasets.validate", "tasks"),
-    "datasets.writer": (*_DATASETS, "datasets.assembly", "datasets.recovery"),
+    "datasets.writer": ("programs", *_DATASETS, "datasets.assembly", "datasets.recovery"),
     "datasets.remote": (*_DATASETS, "datasets.assembly"),
     "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
     "datasets.timing": ("realtime", *_DATASETS, "control"),
     "ros2.messages": ("bodies", "control", "control.geometry", "datasets.format"),
-    "ros2.live": ("bodies", "control", "ros2.messages"),
+    "ros2.live": ("programs", "bodies", "control", "ros2.messages"),
     "ros2.robots": ("bodies", "control", "ros2.live", "ros2.messages"),
     "ros2.serve": (
         *("bodies", "control", "control.geometry", "policies", "policies.navigation"),

@@ -64,6 +64,7 @@ class SharedBlock:
         self.name, self._path = _name(path), path
         self.about: dict[str, Any] = {}
         self._descriptor, self._memory, self._sections = descriptor, memory, sections
+        self._pid = os.getpid()
         self._views: list[memoryview] = []
 
     @classmethod
@@ -207,6 +208,8 @@ class SharedBlock:
         """Leave the block; the last process that does so removes it. May be called twice."""
         if self._descriptor < 0:
             return
+        if self._pid == os.getpid():
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)  # which a process has, too, that was forked since
         os.close(self._descriptor)
         self._descriptor = -1
         # Arrays over the memory may still be around; it is unmapped with the last of them.

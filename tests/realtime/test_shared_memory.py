@@ -5,6 +5,8 @@ import os
 import random
 import shutil
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -88,6 +90,15 @@ def test_a_block_survives_its_maker_and_is_swept_after_its_last_holder(name: str
     assert name not in names()
     assert name in sweep()
     assert not files(name)
+
+
+def test_a_process_that_was_forked_keeps_no_block_that_its_maker_leaves(name: str) -> None:
+    block = SharedBlock.create(name, {"a": 8}, {})
+    command = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=(block._descriptor,)):
+        block.close()
+        assert name not in names()
+        SharedBlock.create(name, {"a": 8}, {}).close()
 
 
 def test_what_cannot_be_is_refused(name: str) -> None:

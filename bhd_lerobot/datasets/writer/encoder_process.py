@@ -22,6 +22,7 @@ import numpy as np
 
 from bhd_lerobot.datasets.format.video import CameraEncoder, VideoSettings
 from bhd_lerobot.errors import FrameError
+from bhd_lerobot.programs import start_program
 
 _SLOTS_BYTES = 64 << 20  # shared memory: 70 images of 640 x 480
 _WAITING_BYTES = 1 << 30  # images that may wait here for room there; beyond that they are dropped
@@ -35,12 +36,8 @@ class EncoderProcess:
         os.ftruncate(self._memory_file, _SLOTS_BYTES)
         self._memory = mmap.mmap(self._memory_file, _SLOTS_BYTES)
         self._pipe, theirs = Pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(theirs.fileno()), str(self._memory_file)],
-            pass_fds=(theirs.fileno(), self._memory_file),
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C in the terminal is for the recording process
-        )
+        descriptors = theirs.fileno(), self._memory_file
+        self._process = start_program(__name__, *descriptors, descriptors=descriptors)
         theirs.close()
         self._encoders: dict[int, RemoteEncoder] = {}
         self._made = 0

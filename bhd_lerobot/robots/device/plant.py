@@ -4,7 +4,6 @@ import mmap
 import os
 import socket
 import subprocess
-import sys
 from dataclasses import dataclass
 from enum import IntEnum
 from multiprocessing.connection import Connection
@@ -19,6 +18,7 @@ from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError, PlantLostError, RealtimeError
+from bhd_lerobot.programs import start_program
 from bhd_lerobot.robots.device.units import Unit, unit_of
 
 _START_S, _END_S = 90.0, 5.0  # that the device's process may take to import and connect, and to disconnect
@@ -114,12 +114,7 @@ class DevicePlant(Plant):
         ours, theirs = socket.socketpair()
         descriptors = theirs.fileno(), self._channel.descriptor
         with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "bhd_lerobot.robots.device.process", *map(str, descriptors)],
-                pass_fds=descriptors,
-                stdin=subprocess.DEVNULL,  # what would ask a person, to calibrate it for example, fails instead
-                start_new_session=True,
-            )
+            self._process = start_program("bhd_lerobot.robots.device.process", *descriptors, descriptors=descriptors)
         self._pipe = Connection(ours.detach())
         try:
             self._pipe.send(self._job)

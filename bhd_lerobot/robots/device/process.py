@@ -97,7 +97,7 @@ class DeviceProcess:
         try:
             robot.connect(calibrate=False)
             if is_calibrated := robot.is_calibrated:
-                self._read()
+                self._found = self._read()
         except Exception as error:  # of another package's code
             raise RealtimeError(
                 f"{self._shown} cannot be connected: {as_text(error)}. Check its power, its cable and its port, and "
@@ -121,7 +121,7 @@ class DeviceProcess:
     def run(self) -> None:
         """Read and send until the plant says end, or is gone."""
         channel, failures, sent = self._channel, 0, 0
-        action = np.nan_to_num(self._read())  # what is no joint of the body stays where it is, and has no speed
+        action = np.nan_to_num(self._found)  # what is no joint of the body stays where it is, and has no speed
         while not channel.words[Word.END]:
             due = time.monotonic() + self._period
             if self._pipe.poll():  # it has closed its end: whoever commands is gone

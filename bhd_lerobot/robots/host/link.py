@@ -6,7 +6,6 @@ import os
 import pickle
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.programs import start_program
 from bhd_lerobot.realtime.block import LiveLayout, Word
 from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.host import Host
@@ -80,6 +80,7 @@ class LiveLink:
         self._plant: str = config.plant
         self._process: subprocess.Popen[bytes] | None = None
         self._stop = threading.Event()
+        self._failure = ""
         self._threads: list[threading.Thread] = []
         self.block = layout.create(name, about)
         self.planner: PlanServer | None = None
@@ -100,13 +101,7 @@ class LiveLink:
     def _start(self, mirror: Host, descriptor: int) -> None:
         spec = LiveSpec.of(mirror, self.block.name)
         pickle.dumps(spec)  # what cannot be sent is found out before a process waits for it
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "bhd_lerobot.robots.host.process", str(descriptor)],
-            pass_fds=(descriptor,),
-            stdin=subprocess.DEVNULL,
-            # A session of its own: Ctrl-C in the terminal is for the brain's process, which ends this one in order.
-            start_new_session=True,
-        )
+        self._process = start_program("bhd_lerobot.robots.host.process", descriptor, descriptors=(descriptor,))
         self._pipe.send(spec)
         self.block.show_life(Word.BRAIN_ALIVE)
         self._threads.append(threading.Thread(target=self._live, name="bhd-brain-life", daemon=True))
@@ -155,7 +150,15 @@ class LiveLink:
             return
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         what = "The plant stops the robot by itself." if self._plant else "The simulated robot ended with it."
-        raise RealtimeError(f"The cerebellum's process {how}. {what} Episodes that were saved are intact.")
+        raise RealtimeError(f"The cerebellum's process {how}. {what} Episodes that were saved are intact.{self._why()}")
+
+    def _why(self) -> str:
+        """Return what the process that has ended sent of it, on lines of its own."""
+        with contextlib.suppress(EOFError, OSError):
+            while self._pipe.poll():
+                kind, value = self._pipe.recv()
+                self._failure = f"\n{value}" if kind == "failed" else self._failure
+        return self._failure
 
     def close(self) -> None:
         """End the process. May be called twice."""

@@ -132,7 +132,7 @@ class LiveProcess:
         period = NANOSECONDS // spec.rates.control_hz
         self._statistics = TimingStatistics(period, self._block.section("statistics"))
         self._warm_up_ticks = round(_WARM_UP_S * spec.rates.control_hz)
-        self._parent = os.getppid()
+        self._brain = int(self._block.about["brain_pid"])
         self._orphan_ticks = 0
         self._standing_ticks = 0
         self._most_orphan_ticks = round(_ORPHAN_S * spec.rates.control_hz)
@@ -149,9 +149,9 @@ class LiveProcess:
         )
 
     def work(self) -> None:
-        """Take messages until the brain's process says end, or is gone."""
+        """Take messages until the brain's process says end, or is gone; one that it forked may hold the pipe open."""
         answers: dict[str, Callable[..., Any]] = {"place": self._place, "run": self._run}
-        while not self._words[Word.END]:
+        while not self._words[Word.END] and os.getppid() == self._brain:
             self._words[Word.PHASE] = Phase.STANDING
             self._block.show_life(Word.CEREBELLUM_ALIVE)
             if not self._connection.poll(_POLL_S):
@@ -217,7 +217,7 @@ class LiveProcess:
 
     def _serve(self, now_ns: int) -> None:
         self._requests.serve(time.monotonic_ns())  # they expire on the clock that both processes share
-        if os.getppid() == self._parent:
+        if os.getppid() == self._brain:
             return
         # The brain's process has ended: come to rest (its watchdog sees to that, a real robot stops at once), then end.
         self._orphan_ticks += 1

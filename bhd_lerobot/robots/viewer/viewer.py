@@ -6,8 +6,6 @@ The viewer is a process of its own that reads what the robot publishes in shared
 import itertools
 import os
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from multiprocessing.connection import Connection
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.scenes import scene_to_json
 from bhd_lerobot.errors import ConfigError, RenderingError
+from bhd_lerobot.programs import start_program
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout
 from bhd_lerobot.robots.host.process import LiveSpec
 from bhd_lerobot.robots.host.realtime import LiveHost
@@ -82,10 +81,8 @@ class Viewer:
             block = self._own = _publish(mirror)
         ours, theirs = socket.socketpair()
         with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "bhd_lerobot.robots.viewer.process", str(theirs.fileno())],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, start_new_session=True,
-            )  # fmt: skip
+            descriptor = theirs.fileno()
+            self._process = start_program("bhd_lerobot.robots.viewer.process", descriptor, descriptors=(descriptor,))
         self._pipe = Connection(ours.detach())
         try:
             self._pipe.send(LiveSpec.of(mirror, block.name))

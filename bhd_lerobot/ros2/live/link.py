@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import PlantLostError, RealtimeError
+from bhd_lerobot.programs import start_program
 from bhd_lerobot.ros2.live.channel import Channel, Word
 from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.spec import NodeSpec
@@ -75,11 +76,8 @@ class NodeLink:
         ours, theirs = socket.socketpair()
         descriptors = (theirs.fileno(), self._channel.descriptor, self._wake)
         with theirs:
-            self._processes[role] = subprocess.Popen(
-                [sys.executable, "-m", "bhd_lerobot.ros2.live.process", role, *map(str, descriptors)],
-                pass_fds=descriptors,
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,
+            self._processes[role] = start_program(
+                "bhd_lerobot.ros2.live.process", role, *descriptors, descriptors=descriptors
             )
         with Connection(ours.detach()) as connection:
             connection.send(self.spec)

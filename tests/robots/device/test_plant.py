@@ -2,9 +2,12 @@
 
 import io
 import os
+import pickle
 import re
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +28,8 @@ from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.robots.arm import SO101
 from bhd_lerobot.robots.config_arm import SO101Config
-from bhd_lerobot.robots.device.plant import DevicePlant
+from bhd_lerobot.robots.device.plant import Channel, DeviceJob, DevicePlant, Word
+from bhd_lerobot.robots.device.process import DeviceProcess
 from tests.robots.device.support import JOINTS, START, STEPS, Bus
 from tests.robots.device.support import bus as bus  # noqa: PLC0414
 from tests.robots.external.mock_devices import MockArmConfig
@@ -116,6 +120,23 @@ def test_reach_is_recorded_with_the_command_of_the_simulation(bus: Bus, tmp_path
     assert not {"device", "units"} & set(info.recording["robot"])  # where it is, and not what it is
     states = np.stack(read_episode(tmp_path / "d", 0)["observation.state"])
     assert np.ptp(states[:, :5], axis=0).max() > 0.05
+
+
+def test_a_reading_that_is_lost_is_none_of_three_in_a_row_the_first_one_included(tmp_path: Path) -> None:
+    ours, theirs = Pipe()
+    device = MockArmConfig(id="lossy", calibration_dir=tmp_path, fault="disconnect", fault_at=2)
+    channel = Channel(3)
+    process = DeviceProcess(DeviceJob(pickle.dumps(device), 3, 100), channel, theirs)
+    ours.send(["shoulder.pos", "elbow.pos", "gripper.pos"])
+    process.connect()
+    with ThreadPoolExecutor(1) as thread, closing(process):
+        running = thread.submit(process.run)
+        until(lambda: running.done() or len(channel.readings) > 3, "it goes on")
+        channel.words[Word.END] = 1
+        running.result()
+    reading = channel.readings.latest()
+    assert reading is not None
+    assert reading["problem"] == b""
 
 
 @pytest.mark.parametrize("victim", ["device", "cerebellum", "none"])

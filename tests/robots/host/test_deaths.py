@@ -1,6 +1,7 @@
 """Processes that are killed or stopped: the stated safe state is reached, nothing is left behind, and it goes on."""
 
 import ctypes
+import json
 import os
 import random
 import signal
@@ -19,6 +20,8 @@ from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.realtime.shared_memory import sweep
 from bhd_lerobot.robots.host import link
+from bhd_lerobot.robots.host.simulation import Simulation
+from tests.forks import Fork
 from tests.recording.support import options
 from tests.robots.host.support import (
     States,
@@ -51,6 +54,25 @@ def test_a_cerebellum_that_is_killed_or_stopped_is_reported_and_ended_and_there_
             assert message in complaint(lambda: robot.send_action({"x.vel": 0.2, "theta.vel": 0.0}))
         assert is_gone(name)
         assert not is_alive(pid)
+
+
+class Broken(Simulation):
+    """Of a plug-in with a bug: it raises when the robot is sent on."""
+
+    def _after_tick(self) -> None:
+        super()._after_tick()
+        if self.cerebellum.command[0, 0] > 0.0:
+            raise ZeroDivisionError("a bug of a plug-in")
+
+
+def test_what_a_cerebellum_raises_is_reported():
+    robot = turtlebot(unique("broken"))
+    robot.simulation_class = Broken
+    with robot:
+        robot.send_action({"x.vel": 0.2, "theta.vel": 0.0})
+        until(lambda: "ended with status 1" in complaint(robot.get_observation), "it has ended")
+        for _ in range(2):
+            assert "ZeroDivisionError: a bug of a plug-in" in complaint(robot.get_observation)
 
 
 @pytest.mark.thorough
@@ -144,6 +166,28 @@ def test_a_brain_that_is_stopped_and_then_killed_leaves_a_robot_that_holds_and_e
         until(lambda: not is_alive(pid), "the process ends by itself")
     sweep()  # this test may have been the last that held it
     assert is_gone(name)
+
+
+def stand(name: str) -> None:
+    """Connect a base and let it stand, while a process of this one holds what goes to the base's."""
+    robot = turtlebot(name)
+    robot.connect()
+    robot.host.link.pause()
+    command = [sys.executable, "-c", "import time; time.sleep(600)"]
+    with subprocess.Popen(command, pass_fds=(robot.host.link._pipe.fileno(),)) as helper:
+        print(json.dumps({"pid": robot.host.link.pid, "helper": helper.pid}), flush=True)
+
+
+def test_a_robot_that_stands_ends_with_its_brain_whatever_that_has_forked(tmp_path):
+    child = Fork(stand, unique("stands"), output=tmp_path / "log")
+    until(lambda: (tmp_path / "log").read_text().endswith("\n"), "the base stands")
+    report = json.loads((tmp_path / "log").read_text())
+    child.kill()
+    try:
+        until(lambda: not is_alive(report["pid"]), "the process ends by itself")
+    finally:
+        os.kill(report["helper"], signal.SIGKILL)
+    sweep()
 
 
 PR_CAPBSET_DROP, CAP_SYS_NICE = 24, 23
