@@ -161,6 +161,10 @@ class EstopInputs:
         source.subscribe(self._on_terminal_keys, first=True)
         return True
 
+    def lend_keys(self) -> contextlib.AbstractContextManager[None]:
+        """Give the terminal back meanwhile, to whoever asks a person in it; see `KeySource.lent`."""
+        return contextlib.nullcontext() if self._keys is None else self._keys.lent()
+
     def add_signal(self, number: signal.Signals = signal.SIGUSR1) -> None:
         """Let a signal press. The former handler comes back with `close`.
 
@@ -299,9 +303,9 @@ class EstopInputs:
                 signal.set_wakeup_fd(-1)
         for thread in self._threads:
             thread.join(0.2)  # a callable that hangs keeps its own thread, and nothing else
-        if threading.current_thread() is threading.main_thread():
-            for descriptor in (self._waker, self._wake, *(self._pipe or ())):
-                os.close(descriptor)
+        is_main = threading.current_thread() is threading.main_thread()
+        for descriptor in (self._waker, self._wake, *(self._pipe if is_main and self._pipe else ())):
+            os.close(descriptor)
 
     def __enter__(self) -> Self:
         return self

@@ -9,13 +9,15 @@ import termios
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 KeyHandler = Callable[[bytes], None]
 """What gets keys as the terminal sends them; b"" when the terminal is gone. It must not block."""
 
+_ROUND_S = 0.2  # [s] between two looks whether the terminal is as it was taken
 _BACKGROUND_S = 0.05  # [s] between two looks whether the terminal is this process's again
+_BY_LINES = termios.ICANON | termios.ECHO  # keys come with Enter, and are shown
 
 
 def standard_input() -> int | None:
@@ -38,12 +40,19 @@ class KeyTerminal:
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
+        self._lock = threading.Lock()
         self._former: list[Any] | None = termios.tcgetattr(descriptor)
-        mode = termios.tcgetattr(descriptor)
-        mode[3] &= ~(termios.ICANON | termios.ECHO)
-        mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
+        self._taken = termios.tcgetattr(descriptor)
+        self._taken[3] &= ~_BY_LINES
+        self._taken[6][termios.VMIN], self._taken[6][termios.VTIME] = 1, 0
         atexit.register(self.restore)
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, mode)
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, self._taken)
+
+    def keep(self) -> None:
+        """Take the terminal again if a shell has had it, which after Ctrl-Z gives it back as it was before."""
+        with self._lock, contextlib.suppress(termios.error):
+            if self._former is not None and termios.tcgetattr(self.descriptor)[3] & _BY_LINES:
+                termios.tcsetattr(self.descriptor, termios.TCSANOW, self._taken)
 
     @staticmethod
     def usable(descriptor: int | None) -> bool:
@@ -55,11 +64,12 @@ class KeyTerminal:
 
     def restore(self) -> None:
         """Put the terminal back to what it was. May be called twice."""
-        former, self._former = self._former, None
-        atexit.unregister(self.restore)
-        if former is not None and self.usable(self.descriptor):
-            with contextlib.suppress(termios.error):
-                termios.tcsetattr(self.descriptor, termios.TCSADRAIN, former)
+        with self._lock:
+            former, self._former = self._former, None
+            atexit.unregister(self.restore)
+            if former is not None and self.usable(self.descriptor):
+                with contextlib.suppress(termios.error):
+                    termios.tcsetattr(self.descriptor, termios.TCSADRAIN, former)
 
 
 class KeySource:
@@ -81,34 +91,56 @@ class KeySource:
         """Call a handler with the keys from now on, from the thread that reads; before all others if `first`."""
         with self._lock:
             self._handlers = (handler, *self._handlers) if first else (*self._handlers, handler)
-            if self._opened is None:
-                reader, writer = os.pipe()
-                terminal = KeyTerminal(self._descriptor)
-                thread = threading.Thread(target=self._work, args=(reader,), name="bhd-keys", daemon=True)
-                self._opened = terminal, thread, writer
-                thread.start()
+            self._open()
 
     def unsubscribe(self, handler: KeyHandler) -> None:
         """Call a handler no more. May be called twice."""
         with self._lock:
             self._handlers = tuple(one for one in self._handlers if one != handler)
-            if self._handlers or self._opened is None:
-                return
-            (terminal, thread, writer), self._opened = self._opened, None
-            os.close(writer)
-            terminal.restore()
-        if thread is not threading.current_thread():
-            thread.join(1.0)
+            thread = None if self._handlers else self._close()
+        _join(thread)
 
-    def _work(self, closing: int) -> None:
+    @contextlib.contextmanager
+    def lent(self) -> Iterator[None]:
+        """Give the terminal back meanwhile, to whoever asks a person in it; what they leave unread comes afterwards."""
+        with self._lock:
+            thread = self._close()
+        _join(thread)
+        try:
+            yield
+        finally:
+            with self._lock:
+                if self._handlers and KeyTerminal.usable(self._descriptor):
+                    self._open()
+
+    def _open(self) -> None:
+        if self._opened is None:
+            terminal = KeyTerminal(self._descriptor)
+            reader, writer = os.pipe()
+            thread = threading.Thread(target=self._work, args=(terminal, reader), name="bhd-keys", daemon=True)
+            self._opened = terminal, thread, writer
+            thread.start()
+
+    def _close(self) -> threading.Thread | None:
+        """Give the terminal back; return the thread, which ends."""
+        if self._opened is None:
+            return None
+        (terminal, thread, writer), self._opened = self._opened, None
+        os.close(writer)
+        terminal.restore()
+        return thread
+
+    def _work(self, terminal: KeyTerminal, closing: int) -> None:
         poll = select.poll()
         poll.register(self._descriptor, select.POLLIN)
         poll.register(closing, select.POLLIN)
         try:
-            while closing not in dict(poll.poll()):
+            while closing not in (events := dict(poll.poll(1000 * _ROUND_S))):
                 if os.isatty(self._descriptor) and not KeyTerminal.usable(self._descriptor):
                     time.sleep(_BACKGROUND_S)  # to read now would stop the whole process: the keys are another's
-                elif not self._read():
+                    continue
+                terminal.keep()
+                if self._descriptor in events and not self._read():
                     return
         finally:
             os.close(closing)
@@ -127,6 +159,11 @@ class KeySource:
             except Exception:  # whatever it is: the emergency stop's key depends on this thread
                 traceback.print_exc()
         return bool(keys)
+
+
+def _join(thread: threading.Thread | None) -> None:
+    if thread is not None and thread is not threading.current_thread():
+        thread.join(1.0)
 
 
 _sources: dict[int, KeySource] = {}  # a terminal is one for the whole process, whoever reads it

@@ -4,7 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,7 +34,7 @@ from bhd_lerobot.recording.report import RecordResult, print_summary
 from bhd_lerobot.recording.reset import ResetPhase
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.recording.takes import Takes
-from bhd_lerobot.registry import make_robot, make_simulation, make_task
+from bhd_lerobot.registry import is_ours, make_robot, make_simulation, make_task
 from bhd_lerobot.robots.host.robots import Robots
 from bhd_lerobot.robots.viewer.viewer import prepare_view, viewed
 from bhd_lerobot.rollout.episode import EpisodeLoop, track_of
@@ -82,7 +82,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         is_main = threading.current_thread() is threading.main_thread()
         if is_main:
             _add_estop_inputs(config, pressed, console)
-        robots = make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
+        robots = _make_robots(config, n, pressed)
         outer.enter_context(closing(robots))
         outer.enter_context(viewed(robots, config.view))
         pressed.attach(robots.estop)
@@ -92,7 +92,7 @@ def record(config: RecordConfig, console: Console | None = None) -> RecordResult
         task = _judged_task(config, robots, console)
         brain = cluster.enter_context(open_driver(config, marks))
         pool = None if is_here else cluster.enter_context(open_pool(config.ray, console))
-        loop = _make_loop(config, robots, task, brain, pool)
+        loop = _make_loop(config, robots, task, brain, pool=pool, pressed=pressed)
         loop.marks, loop.status = marks, status
         print_notes(console, robots, task)
         preview = _make_preview(config, robots, console)
@@ -140,10 +140,19 @@ def _draw(
         preview.close()
 
 
-def _make_loop(config: RecordConfig, robots: Robots, task: Task, brain: Any, pool: WorkerPool | None) -> EpisodeLoop:
+def _make_robots(config: RecordConfig, n: int, pressed: EstopInputs) -> Robots:
+    """Return the robots; what LeRobot drives may ask a person how it is to be calibrated, and gets the keys for it."""
+    with nullcontext() if is_ours(config.robot.type) else pressed.lend_keys():
+        return make_robot(config.robot, n, config.threads, fps=config.dataset.fps, gate=config.gate)
+
+
+def _make_loop(
+    config: RecordConfig, robots: Robots, task: Task, brain: Any, *, pool: WorkerPool | None, pressed: EstopInputs
+) -> EpisodeLoop:
     """Return what runs the episodes; a brain that does not fit the robot fails here, before a dataset exists."""
     if pool is None:
-        return EpisodeLoop(robots, task, brain, config.timing)
+        with pressed.lend_keys():  # a leader arm may ask a person, too
+            return EpisodeLoop(robots, task, brain, config.timing)
     return ClusterLoop(robots, task, brain, config.timing, pool=pool, config=config, brain_config=config.brain)
 
 

@@ -1,7 +1,7 @@
 """Sends the recorded actions of an episode to a robot, and reports how its observations differ from the recording."""
 
 import os
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,8 @@ def replay_on_robot(root: Path, episode: int, robot: Any, gate: GateConfig, cons
     with stop_on_signals() as stop, EstopInputs() as pressed, ExitStack() as opened:
         pressed.add_signal(estop_signal("SIGUSR1"))  # it counts from the first moment on, while there is no robot yet
         key = "space or e, or " if pressed.add_key() else ""
-        robots: Any = opened.enter_context(closing(make_robot(robot, fps=summary.fps, gate=gate)))
+        with nullcontext() if is_ours(robot.type) else pressed.lend_keys():  # it may ask how it is to be calibrated
+            robots: Any = opened.enter_context(closing(make_robot(robot, fps=summary.fps, gate=gate)))
         pressed.attach(robots.estop)
         if set(names) != set(robots.action_names):
             own = ", ".join(robots.action_names)

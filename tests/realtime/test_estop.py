@@ -10,6 +10,7 @@ import sys
 import termios
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import numpy as np
@@ -223,14 +224,22 @@ def test_an_emergency_stop_that_no_tick_has_seen_survives_a_restart():
     assert rig.mode == Mode.UNCONFIGURED
 
 
-def test_after_close_nothing_presses_and_no_thread_is_left(button, wire):
-    before = threading.active_count()
-    inputs = EstopInputs(button.press)
-    inputs.add(wire[0])
-    inputs.add(lambda: False, period_s=0.001)
-    inputs.close()
-    inputs.close()
-    assert threading.active_count() == before
+@pytest.mark.parametrize("is_main", [True, False])
+def test_after_close_nothing_presses_and_no_thread_or_descriptor_is_left(button, wire, is_main):
+    def use() -> None:
+        inputs = EstopInputs(button.press)
+        inputs.add(wire[0])
+        inputs.add(lambda: False, period_s=0.001)
+        inputs.close()
+        inputs.close()
+
+    before = threading.active_count(), len(os.listdir("/proc/self/fd"))
+    if is_main:
+        use()
+    else:
+        with ThreadPoolExecutor(1) as other:
+            other.submit(use).result()
+    assert (threading.active_count(), len(os.listdir("/proc/self/fd"))) == before
     os.write(wire[1], b"x")
     assert not button.word.is_set()
     assert os.read(wire[0], 1) == b"x"  # it is left for the next reader

@@ -83,6 +83,41 @@ def test_the_terminal_is_taken_with_the_first_and_restored_with_the_last(termina
     assert termios.tcgetattr(device) == before
 
 
+def test_keys_come_at_once_again_after_a_shell_has_had_the_terminal(terminal: Terminal) -> None:
+    """By Ctrl-Z, and fg: the emergency stop does not wait for Enter."""
+    person, device = terminal
+    before = termios.tcgetattr(device)
+    pressed = threading.Event()
+    with EstopInputs(pressed.set) as inputs:
+        assert inputs.add_key(device)
+        for _ in range(2):
+            termios.tcsetattr(device, termios.TCSANOW, before)
+            pressed.clear()
+            os.write(person, b" ")
+            until(pressed.is_set, "it is pressed")
+    assert termios.tcgetattr(device) == before
+
+
+def test_while_the_terminal_is_lent_others_read_it_and_what_they_leave_comes_afterwards(terminal: Terminal) -> None:
+    person, device = terminal
+    before = termios.tcgetattr(device)
+    source = key_source(device)
+    assert source is not None
+    got: list[bytes] = []
+    source.subscribe(got.append)
+    with source.lent():
+        assert termios.tcgetattr(device) == before
+        os.write(person, b"c\n")
+        assert os.read(device, 10) == b"c\n"
+        os.write(person, b"e")
+    assert is_taken(device)
+    until(lambda: got == [b"e"])
+    source.unsubscribe(got.append)
+    with source.lent():
+        pass
+    assert termios.tcgetattr(device) == before  # nobody has it
+
+
 def test_a_terminal_that_is_gone_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(KeyTerminal, "usable", staticmethod(os.isatty))
     person, device = pty.openpty()

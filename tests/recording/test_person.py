@@ -128,6 +128,19 @@ def test_a_recording_by_keys(tmp_path: Path) -> None:
     assert "600 s left" in at.text()
 
 
+@pytest.mark.parametrize("who", ["robot", "teleop"])
+def test_what_a_device_asks_while_it_is_connected_is_answered_in_the_terminal(tmp_path: Path, who: str) -> None:
+    takes = {"dataset__num_episodes": 1, f"{who}__fault": "asks"}
+    at = Terminal(main, [PLUGIN, *options(tmp_path / "d", **takes)], log=tmp_path / "log")
+    at.expect("which calibration")
+    for key in b"secsss\n":  # of which the emergency stop and a success are none now
+        time.sleep(0.05)
+        at.type(bytes([key]))
+    at.expect("answered 'secsss'")
+    assert at.wait() == 0, at.text()
+    assert saved(tmp_path / "d") == 1
+
+
 def test_the_line_says_who_drives_and_what_is_left_and_the_bell_rings(tmp_path: Path) -> None:
     marks, taken = Marks(), [False]
     out = io.StringIO()

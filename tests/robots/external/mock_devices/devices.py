@@ -21,6 +21,12 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 JOINTS = ("shoulder.pos", "elbow.pos", "gripper.pos")
 
 
+def _ask(fault: str) -> None:
+    """Ask a person, as LeRobot's devices do that are not calibrated."""
+    if fault == "asks":
+        print(f"answered {input('which calibration? ')!r}", flush=True)
+
+
 @CameraConfig.register_subclass("mock_camera")
 @dataclass
 class MockCameraConfig(CameraConfig):
@@ -146,6 +152,7 @@ class MockArm(Robot):
             raise DeviceAlreadyConnectedError("The mock arm is connected.")
         if self.config.fault == "no connection":
             raise ConnectionError("there is no such port")
+        _ask(self.config.fault)
         for camera in self.cameras.values():
             camera.connect()
         self._is_connected = True
@@ -261,6 +268,7 @@ class MockLeader(Teleoperator):
         return True
 
     def connect(self, calibrate: bool = True) -> None:
+        _ask(self.config.fault)
         self._is_connected, self._started = True, time.monotonic()
 
     def calibrate(self) -> None: ...
