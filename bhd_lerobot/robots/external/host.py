@@ -54,6 +54,7 @@ class LeRobotHost:
         fps: frames a second [Hz].
         config: what is let through to it.
         lock: let go of when it is closed.
+        robot_config: the configuration that the robot was made of; its attribute `config` if None, which not all have.
     """
 
     n = 1
@@ -61,9 +62,11 @@ class LeRobotHost:
     world = None
     knows: frozenset[str] = frozenset()
 
-    def __init__(self, robot: Any, fps: int, config: GateConfig, lock: RobotLock | None = None) -> None:
-        self._lock = lock
-        self.robot, self.config, self._gate_config = robot, robot.config, config
+    def __init__(
+        self, robot: Any, fps: int, config: GateConfig, lock: RobotLock | None = None, robot_config: Any = None
+    ) -> None:
+        self._lock, self.robot = lock, robot
+        self.config = robot.config if robot_config is None else robot_config
         self.device = Device(robot)
         self.rates = Rates(fps, fps, fps)
         self.action_names, self.observation_names = self.device.action_names, self.device.observation_names

@@ -31,7 +31,7 @@ class RobotLock:
     """
 
     def __init__(self, config: Any) -> None:
-        self._file = -1
+        self._file, self._pid = -1, os.getpid()
         places = {
             key: os.path.realpath(value) if str(value).startswith("/") else value
             for key, value in flattened(draccus.encode(config)).items()
@@ -68,5 +68,7 @@ class RobotLock:
     def close(self) -> None:
         """Let go of the robot. May be called twice."""
         if self._file >= 0:
+            if self._pid == os.getpid():
+                fcntl.flock(self._file, fcntl.LOCK_UN)  # which a process has, too, that was forked since
             os.close(self._file)
             self._file = -1

@@ -25,19 +25,22 @@ def make_external(config: Any, fps: int, gate: GateConfig) -> LeRobotHost:
         raise ConfigError(
             f"robot.type is {types_of(config)}, which cannot be made: {as_text(error.__cause__ or error)}."
         ) from error
-    lock = RobotLock(config)
-    try:
-        host = LeRobotHost(robot, fps, gate, lock)  # what cannot be recorded is found out before the robot is touched
-        robot.connect()
-    except (ConfigError, RealtimeError):
-        lock.close()
-        raise
-    except Exception as error:  # of another package's code
-        with contextlib.suppress(Exception):  # what it has connected before it failed
-            robot.disconnect()
-        lock.close()
-        raise RealtimeError(
-            f"The robot {config.type!r} cannot be connected: {as_text(error)}. Check its power, its cable and "
-            "robot.port, and that no other program uses it."
-        ) from error
+    with contextlib.ExitStack() as undo:
+        lock = RobotLock(config)
+        undo.callback(lock.close)
+        try:
+            # What cannot be recorded is found out before the robot is touched.
+            host = LeRobotHost(robot, fps, gate, lock, config)
+            undo.callback(host.close)
+            robot.connect()
+        except (ConfigError, RealtimeError):
+            raise
+        except Exception as error:  # of another package's code
+            with contextlib.suppress(Exception):  # what it has connected before it failed
+                robot.disconnect()
+            raise RealtimeError(
+                f"The robot {config.type!r} cannot be connected: {as_text(error)}. Check its power, its cable and "
+                "robot.port, and that no other program uses it."
+            ) from error
+        undo.pop_all()
     return host

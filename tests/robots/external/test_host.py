@@ -2,6 +2,8 @@
 
 import itertools
 import re
+import subprocess
+import sys
 import threading
 import time
 from contextlib import closing
@@ -12,12 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot import stock
 from bhd_lerobot.control.commands import Chunk, Goals
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.host import LeRobotHost
+from bhd_lerobot.robots.external.lock import RobotLock
+from bhd_lerobot.robots.external.make import make_external
 from tests.robots.external.mock_devices import MockArm, MockArmConfig
 from tests.robots.external.mock_devices.devices import MockCameraConfig
 from tests.waiting import until
@@ -216,6 +221,43 @@ def test_what_cannot_be_recorded_is_refused_before_the_robot_is_touched(tmp_path
     with pytest.raises(ConfigError, match=r"depth.*\(48, 64, 1\).*Switch depth off"):
         LeRobotHost(robot, FPS, GateConfig())
     assert not robot.is_connected
+
+
+class Bare:
+    """Does not keep its configuration: LeRobot's base class does not ask for that."""
+
+    name, is_connected = "bare", False
+
+    def __init__(self) -> None:
+        self.observation_features = self.action_features = {"elbow.pos": float}
+
+    def connect(self) -> None:
+        self.is_connected = True
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+
+def test_a_robot_need_not_keep_its_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = MockArmConfig(id="bare", calibration_dir=tmp_path, port=str(tmp_path))
+    monkeypatch.setattr(stock, "make_robot_from_config", lambda _: Bare(), raising=False)
+    with closing(make_external(config, FPS, GateConfig())) as host:
+        assert host.config is config
+        assert host.robot.is_connected
+    assert not host.robot.is_connected
+
+
+def test_a_robot_that_cannot_be_connected_leaves_nothing_behind(tmp_path: Path) -> None:
+    config = MockArmConfig(id="none", calibration_dir=tmp_path, port=str(tmp_path), fault="no connection")
+    before = threading.active_count()
+    with pytest.raises(RealtimeError, match="'mock_arm' cannot be connected: ConnectionError: there is no such port"):
+        make_external(config, FPS, GateConfig())
+    assert threading.active_count() == before
+    lock = RobotLock(config)  # nobody uses it
+    command = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=(lock._file,)):
+        lock.close()
+        RobotLock(config).close()  # nor does one that was forked meanwhile
 
 
 class MockBase(MockArm):
