@@ -6,9 +6,9 @@ Colour = tuple[float, float, float]
 
 
 def add_backdrop(spec: mujoco.MjSpec, sky: tuple[Colour, Colour], floor: tuple[Colour, Colour]) -> None:
-    """Add the sky, and the material ``"floor"``."""
+    """Add the sky, and the material ``"stage_floor"``: a robot's file may have names like ours."""
     spec.add_texture(
-        name="sky",
+        name="stage_sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=list(sky[0]),
@@ -17,7 +17,7 @@ def add_backdrop(spec: mujoco.MjSpec, sky: tuple[Colour, Colour], floor: tuple[C
         height=384,
     )
     spec.add_texture(
-        name="floor",
+        name="stage_floor",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=list(floor[0]),
@@ -25,5 +25,5 @@ def add_backdrop(spec: mujoco.MjSpec, sky: tuple[Colour, Colour], floor: tuple[C
         width=128,
         height=128,
     )
-    material = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True, specular=0.1)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    material = spec.add_material(name="stage_floor", texrepeat=[2, 2], texuniform=True, specular=0.1)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage_floor"

@@ -36,16 +36,18 @@ def build_model(
         raise ConfigError(f"The MJCF of body {body.name!r} is not valid: {error}") from error
     spec.option.timestep = 1.0 / physics_hz
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    if body.drive is not None:
-        _add_arena_stage(spec, body, body.drive.touch_sensor, pool_size)
-        if body.arm is not None:
-            add_mobile_arm(spec, body.root, body.arm)
-    else:
-        add_table_stage(spec, body.root, body.need(Arm), fixtures)
     try:
+        if body.drive is not None:
+            _add_arena_stage(spec, body, body.drive.touch_sensor, pool_size)
+            if body.arm is not None:
+                add_mobile_arm(spec, body.root, body.arm)
+        else:
+            add_table_stage(spec, body.root, body.need(Arm), fixtures)
         model = spec.compile()
     except ValueError as error:
-        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}") from error
+        is_ours = "repeated name" in str(error)
+        hint = " Rename it in the file of the robot: it is a name of our scene." if is_ours else ""
+        raise ConfigError(f"The MJCF of body {body.name!r} does not compile: {error}.{hint}") from error
     if body.arm is not None:
         set_home(model, body.arm)
     # The compiler marks geometries that have the orientation of their body, and the engine then leaves theirs out of
@@ -87,14 +89,14 @@ def _add_stage(spec: mujoco.MjSpec) -> None:
         sky=((0.78, 0.86, 0.95), (0.95, 0.97, 1.0)),
         floor=((0.80, 0.80, 0.78), (0.72, 0.72, 0.70)),
     )
-    spec.add_material(name="obstacle", rgba=[0.80, 0.55, 0.30, 1.0], specular=0.1)
+    spec.add_material(name="stage_obstacle", rgba=[0.80, 0.55, 0.30, 1.0], specular=0.1)
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         # The third is the edge of the squares that the plane is drawn in: at 0.1 m they took a software renderer three
         # quarters of the time of a small image, and at 2 m the image is the same.
         size=[20, 20, 2],
-        material="floor",
+        material="stage_floor",
         contype=_FLOOR_BIT,
         conaffinity=0,
         # One sliding contact for each wheel needs no torsional or rolling friction.
@@ -124,7 +126,7 @@ def _add_pool(spec: mujoco.MjSpec, pool_size: int) -> None:
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=[0.01, 0.01, 0.01],
             pos=[0, 0, PARKED_Z],
-            material="obstacle",
+            material="stage_obstacle",
             contype=_SCENE_BIT,
             group=PARKED_GROUP,
             conaffinity=0,

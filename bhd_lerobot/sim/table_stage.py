@@ -133,7 +133,7 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=[20, 20, 2],  # in squares of 2 m: see sim/scene.py
         pos=[0, 0, FLOOR],
-        material="floor",
+        material="stage_floor",
         contype=0,
         conaffinity=0,
     )
@@ -141,8 +141,8 @@ def _add_room(spec: mujoco.MjSpec) -> None:
 
 def _add_table(spec: mujoco.MjSpec) -> None:
     """Add a table that is only rendered, and a plane to touch, without edges: contacts with it are cheap and exact."""
-    spec.add_material(name="table", rgba=[0.70, 0.56, 0.40, 1.0], specular=0.15, shininess=0.3)
-    spec.add_material(name="leg", rgba=[0.25, 0.26, 0.28, 1.0], specular=0.3)
+    spec.add_material(name="stage_table", rgba=[0.70, 0.56, 0.40, 1.0], specular=0.15, shininess=0.3)
+    spec.add_material(name="stage_leg", rgba=[0.25, 0.26, 0.28, 1.0], specular=0.3)
     table = spec.worldbody.add_body(name="table")
     # The larger friction of the two that touch counts: with so little here it is the object's.
     table.add_geom(
@@ -157,11 +157,11 @@ def _add_table(spec: mujoco.MjSpec) -> None:
     )
     back, front, half = _TABLE
     middle, length = (back + front) / 2, (front - back) / 2
-    _visual(table, "box", (middle, 0, -0.02), (length, half, 0.02), name=TABLE_TOP, material="table")
-    _visual(table, "box", (0, 0, 0.0005), (0.11, 0.11, 0.0015), material="leg")  # the mounting plate
+    _visual(table, "box", (middle, 0, -0.02), (length, half, 0.02), name=TABLE_TOP, material="stage_table")
+    _visual(table, "box", (0, 0, 0.0005), (0.11, 0.11, 0.0015), material="stage_leg")  # the mounting plate
     for x in (back + 0.06, front - 0.06):
         for y in (-half + 0.06, half - 0.06):
-            _visual(table, "box", (x, y, (FLOOR - 0.04) / 2), (0.03, 0.03, -(FLOOR + 0.04) / 2), material="leg")
+            _visual(table, "box", (x, y, (FLOOR - 0.04) / 2), (0.03, 0.03, -(FLOOR + 0.04) / 2), material="stage_leg")
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:

@@ -113,20 +113,24 @@ class _Arm(RobotFile):
         data = mujoco.MjData(model)
         self._set(data, self.home)
         mujoco.mj_kinematics(model, data)
-        self.root = model.body(self._root(self.last)).name
+        root = self._root(self.last)
+        self.root = model.body(root).name
         where = self._stand(data)
         kept = set(self.names) | {
             model.joint(one).name for one in range(model.njnt) if self.joints[-1] in self._above(model.jnt_bodyid[one])
         }
-        for kind in (spec.keys, spec.sensors, spec.lights, spec.actuators):
+        own = {model.geom(g).name for g in range(model.ngeom) if self._root(model.geom_bodyid[g]) == root}
+        strange = [pair for pair in spec.pairs if not {pair.geomname1, pair.geomname2} <= own]
+        for kind in (spec.keys, spec.sensors, spec.lights, spec.actuators, strange):
             for one in list(kind):
                 spec.delete(one)
-        unit = np.pi / 180 if spec.compiler.degree else 1.0  # of the file's angles
         for joint in list(spec.joints):
             if joint.name not in kept:
                 spec.delete(joint)
             elif joint.name in self.names:
                 number = self.names.index(joint.name)
+                # In the unit of its own file, which may be attached to another one.
+                unit = np.pi / 180 if getattr(joint, "compiler", spec.compiler).degree else 1.0
                 joint.damping = 0.0 if np.isscalar(joint.damping) else [0.0] * len(joint.damping)
                 if self.file.servos:
                     joint.frictionloss = self.servos[number].friction

@@ -26,8 +26,8 @@ def load_model(path: str) -> Any:
     for files, where in ((spec.meshes, spec.meshdir), (spec.hfields, spec.meshdir), (spec.textures, spec.texturedir)):
         for one in files:
             if one.file:
-                one.file = str(folder / where / one.file)
-    spec.meshdir = spec.texturedir = ""
+                one.file = str(folder / where / (Path(one.file).name if spec.strippath else one.file))
+    spec.meshdir, spec.texturedir, spec.strippath = "", "", False
     return spec
 
 
@@ -49,9 +49,11 @@ def _urdf(path: str) -> str:
 
 def joint_speeds(path: str) -> dict[str, float]:
     """Return the largest speeds of a URDF's joints [rad/s], which MuJoCo does not read."""
-    found = {}
-    for joint in re.findall(r"<joint\b.*?</joint>", Path(path).read_text(encoding="utf-8"), re.DOTALL):
-        name, speed = re.search(r'name="([^"]+)"', joint), re.search(r'velocity="([^"]+)"', joint)
+    found, text = {}, re.sub("<!--.*?-->", "", Path(path).read_text(encoding="utf-8"), flags=re.DOTALL)
+    for joint in re.findall(r"<joint\b[^>]*[^/>]>.*?</joint>", text, re.DOTALL):
+        # Of its limits: a safety controller has a `k_velocity`, which is none.
+        speed = re.search(r'<limit\b[^>]*\bvelocity="([^"]+)"', joint)
+        name = re.search(r'\bname="([^"]+)"', joint)
         if name and speed and float(speed[1]) > 0:
             found[name[1]] = float(speed[1])
     return found

@@ -20,6 +20,8 @@ OPENING = "opening_of_gripper"
 """The tendon of two fingers that nothing in the file couples."""
 _FEWEST, _MOST = 4, 7  # joints of an arm
 _GRIP_N = 20.0  # [N] of a gripper whose force the file does not bound
+_OF_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_OF_TENDONS = int(mujoco.mjtTrn.mjTRN_TENDON)
 _TOOL_WORDS = ("tcp", "frame", "tool", "pinch", "grasp", "grip", "attach", "eef", "ee", "hand")
 
 
@@ -60,7 +62,7 @@ class RobotFile:
 
     def _name_all(self) -> None:
         """Give a name to what has none: everything is found by its name later."""
-        for kind in ("bodies", "joints", "geoms"):
+        for kind in ("bodies", "joints", "geoms", "cameras"):
             for number, one in enumerate(getattr(self.spec, kind)):
                 one.name = one.name or f"{kind}_{number}"
         self.model = compiled(self.spec, self.file.path)
@@ -184,11 +186,8 @@ class RobotFile:
 
     def _of_joint(self, joint: int) -> list[int]:
         """Return the actuators of a joint."""
-        kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-        model = self.model
-        return [
-            a for a in range(model.nu) if model.actuator_trntype[a] in kinds and model.actuator_trnid[a, 0] == joint
-        ]
+        kinds, targets = self.model.actuator_trntype, self.model.actuator_trnid
+        return [a for a in range(self.model.nu) if kinds[a] in _OF_JOINTS and targets[a, 0] == joint]
 
     def _servo(self, number: int) -> Servo:
         """Return the servo of a joint of the arm; that of the file if it has a position servo."""
@@ -244,9 +243,8 @@ class RobotFile:
         by_tendon = {model.tendon(t).name: joints for t in range(model.ntendon) if (joints := self._wrapped(t))}
         movers: dict[int, list[int]] = {}  # actuators, and the joints that they move
         for one in range(model.nu):
-            target = int(model.actuator_trnid[one, 0])
-            kind = int(model.actuator_trntype[one])
-            moved = self._wrapped(target) if kind == int(mujoco.mjtTrn.mjTRN_TENDON) else [target]
+            target, kind = int(model.actuator_trnid[one, 0]), int(model.actuator_trntype[one])
+            moved = self._wrapped(target) if kind == _OF_TENDONS else [target] * (kind in _OF_JOINTS)
             if moved and set(moved) <= set(below):
                 movers[one] = moved
         by_actuator = {model.actuator(one).name: one for one in movers}
@@ -350,7 +348,7 @@ class RobotFile:
         closed, opened = (tuple(one) for one in zip(*ends, strict=True))
         tendon, pull = "", (closed[0], opened[0] - closed[0])
         actuator, gains = self.actuator, None
-        if actuator is not None and model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_TENDON):
+        if actuator is not None and model.actuator_trntype[actuator] == _OF_TENDONS:
             number = int(model.actuator_trnid[actuator, 0])
             tendon = model.tendon(number).name
             first, last = (self._length(number, values) for values in (closed, opened))
@@ -381,7 +379,8 @@ class RobotFile:
         if actuator is not None:
             gains = _position_gains(model, actuator)
             if model.actuator_forcelimited[actuator]:
-                effort = float(model.actuator_forcerange[actuator, 1]) * scale
+                gear = abs(float(model.actuator_gear[actuator, 0]))
+                effort = gear * float(model.actuator_forcerange[actuator, 1]) * scale
         elif model.jnt_actfrclimited[joints[0]]:
             effort = float(model.jnt_actfrcrange[joints[0], 1]) / abs(spec.per_joint[0])
         if gains is None:

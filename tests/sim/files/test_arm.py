@@ -13,6 +13,7 @@ import pytest
 from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
 from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
 from bhd_lerobot.bodies.so101 import SO101
+from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
@@ -20,7 +21,9 @@ from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.files.arm import arm_body
+from bhd_lerobot.sim.files.model import joint_speeds
 from bhd_lerobot.sim.plant import SimulatedPlant
+from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
 from tests.cases import each_case
 
@@ -132,6 +135,82 @@ def test_however_the_file_is_written_it_is_the_same_arm(tmp_path: Path) -> None:
     np.testing.assert_allclose(turned.limits.upper, plain.limits.upper, atol=1e-5)
     ends = [model.joint(name).range[1] for name in turned.chain.joints]
     np.testing.assert_allclose(ends, turned.limits.upper[: len(ends)], atol=1e-9)
+
+
+FLOOR = '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'
+ATTACHED = (
+    '<mujoco><compiler angle="degree"/><asset><model name="child" file="child.xml"/></asset>'
+    '<worldbody><frame><attach model="child" body="base" prefix="r_"/></frame></worldbody></mujoco>'
+)
+LINK = "v 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0 0 0.01\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@each_case(
+    "text",
+    [
+        TEXT.replace('<camera name="wrist" ', "<camera "),
+        TEXT.replace(
+            "<asset>",
+            '<asset><texture name="sky" type="skybox" builtin="gradient" width="8" height="8"/>'
+            '<material name="floor"/><material name="table"/><material name="leg"/>',
+        ),
+        TEXT.replace("<worldbody>", FLOOR).replace(
+            "</worldbody>", '</worldbody><contact><pair geom1="floor" geom2="moving_jaw"/></contact>'
+        ),
+        TEXT.replace("<actuator>", '<actuator><adhesion name="suck" body="jaw" gain="1" ctrlrange="0 1"/>'),
+        TEXT.replace(
+            '<position name="gripper" joint="gripper"/>',
+            '<position name="gripper" joint="gripper" gear="2" kp="4.45" forcerange="-1.47 1.47"/>',
+        ),
+        TEXT.replace('autolimits="true"/>', 'autolimits="true" meshdir="assets" strippath="true"/>')
+        .replace("<asset>", '<asset><mesh name="link" file="../other/link.obj"/>')
+        .replace(
+            '<geom name="stand"',
+            '<geom name="link" type="mesh" mesh="link" mass="0" contype="0" conaffinity="0"/><geom name="stand"',
+        ),
+        ATTACHED,
+    ],
+)
+def test_a_file_with_parts_that_are_not_the_arms_is_simulated_as_the_same_arm(text: str, tmp_path: Path) -> None:
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "assets" / "link.obj").write_text(LINK, encoding="utf-8")
+    (tmp_path / "child.xml").write_text(TEXT, encoding="utf-8")
+    plain, body = (arm_body(written(tmp_path, one, f"{number}.xml")) for number, one in enumerate((TEXT, text)))
+    arm, wanted = body.need(Arm), plain.need(Arm)
+    np.testing.assert_allclose(arm.limits.effort, wanted.limits.effort, rtol=1e-6)
+    np.testing.assert_allclose(arm.limits.upper, wanted.limits.upper, atol=1e-6)
+    world = World(body)
+    Tabletop(world).place([TableScene("task", (), arm.home)])
+    ends = [world.model.joint(name).range[1] for name in arm.chain.joints]
+    np.testing.assert_allclose(ends, arm.limits.upper[: arm.chain.dof], atol=1e-6)
+    for _ in range(20):
+        world.step()
+    world.check()
+
+
+@each_case(
+    ("there", "named"),
+    [
+        ('<camera name="wrist"', '<camera name="scene"'),
+        ('<body name="base"', '<body name="table"'),
+        ('<geom name="foot"', '<geom name="floor"'),
+    ],
+)
+def test_a_name_of_our_scene_is_refused(there: str, named: str, tmp_path: Path) -> None:
+    body = arm_body(written(tmp_path, TEXT.replace(there, named)))
+    with pytest.raises(ConfigError, match="Rename it in the file of the robot"):
+        Tabletop(World(body))
+
+
+def test_speeds_of_a_urdf_are_those_of_its_limits(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        '<robot name="arm"><joint name="one" type="revolute"><safety_controller k_velocity="40.0"/>'
+        '<limit effort="87" lower="-1" upper="1" velocity="2.175"/></joint>'
+        '<!-- <joint name="two"><limit velocity="9"/></joint> --></robot>',
+        encoding="utf-8",
+    )
+    assert joint_speeds(str(path)) == {"one": 2.175}
 
 
 @each_case(
