@@ -80,7 +80,7 @@ class BhdBrain(PlainTeleoperator):
         self.config = config
         self._is_connected = False
         self._brain: Brain | None = None
-        self._robot: BhdRobot | None = None
+        self._host: Any = None  # of the robot that it drives
         self._streamer: GoalStreamer | None = None
         self._chunk: list[NDArray[np.float64]] = []
         self._results: list[CommandResult] = []
@@ -124,7 +124,8 @@ class BhdBrain(PlainTeleoperator):
 
     def _next_action(self) -> dict[str, Any]:
         robot = self._find_robot()
-        if robot is not self._robot or self._brain is None:
+        if robot.host is not self._host or self._brain is None:
+            self._forget()
             if not drives(self.config.brain, robot.config):
                 is_arm = robot.host.body.arm is not None and robot.host.body.drive is None
                 example = " For example: --teleop.brain.type=reach --robot.scene=reach." if is_arm else ""
@@ -138,7 +139,7 @@ class BhdBrain(PlainTeleoperator):
             body, cameras = robot.host.body, robot.camera_shapes
             self._brain.bind(RobotFeatures(robot.observation_names, robot.action_names, fps, names, body, cameras))
             self._brain.reset(np.zeros(1, np.intp), [self.config.seed], 1, [robot.instruction])
-            self._robot, self._streamer, self._results, self._chunk = robot, None, [], []
+            self._host, self._results, self._chunk = robot.host, [], []
         seen = robot.last_observation
         state = np.array([[seen[name] for name in robot.observation_names]])
         images = {name: seen[name][None] for name in robot.camera_shapes}
@@ -182,7 +183,12 @@ class BhdBrain(PlainTeleoperator):
     def disconnect(self) -> None:
         """Forget the robot. May be called twice."""
         self._is_connected = False
-        self._brain = self._robot = self._streamer = None
+        self._forget()
+
+    def _forget(self) -> None:
+        if self._brain is not None:
+            self._brain.close()
+        self._brain = self._host = self._streamer = None
 
     @property
     def _brain_name(self) -> str:

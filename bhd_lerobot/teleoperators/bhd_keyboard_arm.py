@@ -9,7 +9,7 @@ import numpy as np
 from bhd_lerobot.bodies.body import Arm, Body
 from bhd_lerobot.bodies.registry import body_with
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.robot import BhdRobot, connected_robots
+from bhd_lerobot.robots.robot import connected_robots
 from bhd_lerobot.teleoperators.config_bhd_keyboard_arm import MAX_SPEED, MAX_TURN_SPEED, BhdKeyboardArmConfig
 from bhd_lerobot.teleoperators.keyboard import FASTER, SLOWER, KeyboardTeleoperator, say
 from bhd_lerobot.teleoperators.plain import TeleoperatorConfigError
@@ -20,12 +20,13 @@ _GRIPPER_SPEED = 0.1  # [m/s] of the opening; an estimate, slow enough for a gri
 _GRIP_M = 0.01  # [m] that a gripper is closed further than what it may hold is wide
 _LONGEST_STEP_S = 0.1  # [s] that one action moves the target for: a program that was held up does not catch up
 
-# Which of the six coordinates a key moves, and in which direction.
+# Which of the six coordinates, or of seven joints, a key moves, and in which direction.
 _TOOL_KEYS = {
     **{"w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "r": (2, 1), "f": (2, -1)},
     **{"u": (3, 1), "o": (3, -1), "i": (4, 1), "k": (4, -1), "j": (5, 1), "l": (5, -1)},
 }
-_JOINT_KEYS = {key: (joint, sign) for sign, row in ((1, "asdfhj"), (-1, "zxcvnm")) for joint, key in enumerate(row)}
+_ROWS = (1, "asdfhjk"), (-1, "zxcvnm,")
+_JOINT_KEYS = {key: (joint, sign) for sign, row in _ROWS for joint, key in enumerate(row)}
 _HELP = {
     "tool": """\
 Keys of bhd_keyboard_arm, lower case, held down; any other key stops. Axes are those of the base:
@@ -33,7 +34,7 @@ w/s forward or back (x), a/d left or right (y), r/f up or down (z);
 u/o, i/k, j/l turn the tool about x, y, z, counter-clockwise or clockwise;""",
     "joint": """\
 Keys of bhd_keyboard_arm, lower case, held down; any other key stops:
-a s d f h j turn the six joints from the base on forward, z x c v n m below them back;""",
+a s d f h j k turn the joints from the base on forward, z x c v n m , below them back;""",
 }
 
 
@@ -55,7 +56,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
     def __init__(self, config: BhdKeyboardArmConfig, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(config, _TOOL_KEYS if config.action_space == "tool" else _JOINT_KEYS, clock)
         self._speed, self._turn_speed = config.speed, config.turn_speed
-        self._robot: BhdRobot | None = None
+        self._host: Any = None  # of the robot that it has found
         self._arm = body_with(Arm).need(Arm)  # until it is known
         self._observation: Mapping[str, Any] | None = None  # that someone has passed
         self._target: Target | None = None
@@ -73,6 +74,10 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         return f"Now {moves}{self._turn_speed:.3f} rad/s."
 
     @property
+    def _grips(self) -> bool:
+        return self._arm.gripper is not None
+
+    @property
     def _widest(self) -> float:
         gripper = self._arm.gripper
         largest = gripper.max_opening if gripper else 0.0
@@ -80,9 +85,9 @@ class BhdKeyboardArm(KeyboardTeleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """A pose of the tool, or joint positions, and the gripper's opening."""
+        """A pose of the tool, or joint positions, and the opening of a gripper."""
         names = POSE_NAMES if self.config.action_space == "tool" else joint_names(self._arm)
-        return dict.fromkeys((*names, GRIPPER), float)
+        return dict.fromkeys((*names, *[GRIPPER] * self._grips), float)
 
     def adjust(self, key: str) -> bool:
         """Apply a key of the gripper or of the speeds."""
@@ -96,6 +101,10 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         else:
             return False
         return True
+
+    def learn(self, body: Body) -> None:
+        """Learn what robot is moved, of which its joints and its gripper count."""
+        self._arm = body.arm or self._arm
 
     def start_from(self, observation: Mapping[str, Any], body: Body | None = None) -> None:
         """Begin where the robot is.
@@ -117,13 +126,13 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         self._observation = observation
 
     def _begin(self, observation: Mapping[str, Any]) -> None:
-        if GRIPPER not in observation:
+        if self._grips and GRIPPER not in observation:
             raise ConfigError(f"The observation has {', '.join(observation)}; bhd_keyboard_arm needs {GRIPPER}, too.")
         if self.config.action_space == "tool":
             self._target = ToolTarget(observation, self._arm, say)
         else:
             self._target = JointTarget(observation, self._arm)
-        self._opening = self._opening_target = float(observation[GRIPPER])
+        self._opening = self._opening_target = float(observation.get(GRIPPER, 0.0))
         if self._opening < self._widest - _GRIP_M:  # it may hold something, and is not to let it go
             self._opening_target = max(0.0, self._opening - _GRIP_M)
         self._last = self._clock()
@@ -144,7 +153,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         assert self._target is not None
         now = self._clock()
         step, self._last = min(now - self._last, _LONGEST_STEP_S), now
-        change = np.zeros(6)
+        change = np.zeros(7)
         if key := self.held(now):
             coordinate, sign = self.motions[key]
             is_length = self.config.action_space == "tool" and coordinate < 3
@@ -152,7 +161,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
         self._target.move(change, observation)
         reach = _GRIPPER_SPEED * step
         self._opening += min(max(self._opening_target - self._opening, -reach), reach)
-        return {**dict(zip(self._target.names, self._target.values(), strict=True)), GRIPPER: self._opening}
+        return dict(zip(self.action_features, (*self._target.values(), self._opening), strict=False))
 
     def _newest(self) -> Mapping[str, Any]:
         """Return the newest observation; begin with it if it is another robot's than before."""
@@ -168,7 +177,7 @@ class BhdKeyboardArm(KeyboardTeleoperator):
                 f"in its process; connected are: {found}. Use --robot.type=ur5 with it, and no other robot."
             )
         (robot,) = robots
-        if robot is not self._robot:
+        if robot.host is not self._host:
             arm = robot.host.body.arm
             self._arm = arm or self._arm
             if list(robot.action_names) != list(self.action_features) or arm is None:
@@ -178,10 +187,10 @@ class BhdKeyboardArm(KeyboardTeleoperator):
                     "--robot.action_space and --teleop.action_space. A base needs --teleop.type=bhd_keyboard_base."
                 )
             self._begin(robot.last_observation)
-            self._robot = robot
+            self._host = robot.host
         return robot.last_observation
 
     def disconnect(self) -> None:
         """Give the terminal back, and forget the robot. May be called twice."""
         super().disconnect()
-        self._robot = self._observation = self._target = None
+        self._host = self._observation = self._target = None

@@ -35,7 +35,10 @@ class Target(Protocol):
         """Return it, in the order of `names`."""
 
     def move(self, change: Array, observation: Mapping[str, Any]) -> None:
-        """Move it by a change of shape (6,), and keep it near to what is observed."""
+        """Move it by a change of shape (7,), and keep it near to what is observed.
+
+        Of joints it is one for each, of a tool along and about x, y, z: what is beyond these means nothing.
+        """
 
 
 def joint_names(arm: Arm) -> tuple[str, ...]:
@@ -78,7 +81,8 @@ class JointTarget:
     def move(self, change: Array, observation: Mapping[str, Any]) -> None:
         """Turn joints [rad]."""
         measured = self._measured(observation)
-        self._joints = np.clip(self._joints + change, measured - LEASH_RAD, measured + LEASH_RAD)
+        turned = self._joints + change[: len(measured)]
+        self._joints = np.clip(turned, measured - LEASH_RAD, measured + LEASH_RAD)
 
 
 class ToolTarget:
@@ -127,7 +131,7 @@ class ToolTarget:
         """Move the tool along [m] and turn it about [rad] the axes of the base frame."""
         position, rotation = self._measured(observation)
         offset = self._position + change[:3] - position
-        turn = (Rotation.from_rotvec(change[3:]) * self._rotation * rotation.inv()).as_rotvec()
+        turn = (Rotation.from_rotvec(change[3:6]) * self._rotation * rotation.inv()).as_rotvec()
         wanted = position + _shortened(offset, LEASH_M), Rotation.from_rotvec(_shortened(turn, LEASH_RAD)) * rotation
         problem = self._problem(_matrix(*wanted))
         if not problem:

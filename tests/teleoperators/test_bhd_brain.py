@@ -9,6 +9,7 @@ import pytest
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from bhd_lerobot.errors import ConfigError
+from bhd_lerobot.policies.navigation.avoidance import AvoidanceBrain
 from bhd_lerobot.robots.config_mobile_arm import TurtleBot3ManipulationConfig
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
@@ -61,6 +62,21 @@ def test_it_needs_exactly_one_robot_and_to_be_connected_once(tmp_path, teleop):
         teleop.config.robot_id = "tow"
         with pytest.raises(ConfigError, match="Did you mean 'two'"):
             teleop.get_action()
+
+
+def test_a_robot_that_is_connected_again_gets_a_brain_of_its_own_and_every_brain_is_closed(robot, teleop, monkeypatch):
+    calls = []
+    for call in ("reset", "close"):
+        monkeypatch.setattr(AvoidanceBrain, call, lambda *_, call=call: calls.append(call))
+    teleop.get_action()
+    teleop.get_action()
+    assert calls == ["reset"]
+    robot.disconnect()
+    robot.connect()
+    teleop.get_action()
+    assert calls == ["reset", "close", "reset"]
+    teleop.disconnect()
+    assert calls == ["reset", "close", "reset", "close"]
 
 
 def record_and_replay(robot: str, fps: int, *options: str) -> None:

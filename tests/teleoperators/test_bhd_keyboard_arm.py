@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,24 @@ def test_joints_and_opening_are_those_of_the_arm(make: Any, clock: Clock, person
         clock.now += FRAME
         action = teleop.get_action()
     assert action["gripper.pos"] == 0.05
+
+
+@each_case("joints", [4, 5, 7])
+def test_keys_turn_the_joints_that_an_arm_has(make: Any, clock: Clock, person: Person, joints: int) -> None:  # noqa: F811
+    """One without a gripper has no opening."""
+    names = tuple(f"j{number}" for number in range(joints))
+    arm = SimpleNamespace(chain=SimpleNamespace(joints=names), gripper=None)
+    teleop = make(action_space="joint", turn_speed=0.3)
+    teleop.learn(SimpleNamespace(arm=arm))
+    start = dict.fromkeys((f"{name}.pos" for name in names), 0.5)
+    for sign, keys in zip((1, -1), ("asdfhjk", "zxcvnm,"), strict=True):
+        for joint, key in enumerate(keys):
+            teleop.start_from(start)
+            person.press(key, teleop)
+            clock.now += FRAME
+            turned = {name: 0.5 + sign * FRAME * 0.3 * (name == f"j{joint}.pos") for name in start}
+            assert teleop.get_action() == pytest.approx(turned)
+            assert list(teleop.action_features) == list(turned)
 
 
 @each_case("space", ["tool", "joint"])

@@ -66,10 +66,12 @@ class TeleopBrain(Brain):
                     f"The teleoperator {teleop_type!r} cannot be connected: {as_text(error)}. Check its power, its "
                     "cable and its port, and that no other program uses it."
                 ) from error
+        is_ours = robot.body is not None, type(self.teleop).__module__.startswith(_OURS)
+        if all(is_ours) and (learn := getattr(self.teleop, "learn", None)) is not None:
+            learn(robot.body)
         features = tuple(self.teleop.action_features)
         if set(features) == {"dtype", "shape", "names"}:  # the other form in which LeRobot's teleoperators say it
             features = tuple(self.teleop.action_features["names"])
-        is_ours = robot.body is not None, type(self.teleop).__module__.startswith(_OURS)
         if self._process is None:
             asked = flattened(self.config.map)
             drive = robot.body.drive if robot.body else None
