@@ -13,6 +13,7 @@ from bhd_lerobot.errors import RealtimeError, as_text
 from bhd_lerobot.ros2.live.graph import Graph
 from bhd_lerobot.ros2.live.network import NetworkConfig, Qos, require_cyclonedds
 from bhd_lerobot.ros2.live.topic_types import raw, sample_class
+from bhd_lerobot.ros2.messages.definitions import find_type
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.types import type_store
 
@@ -175,6 +176,7 @@ class Node:
     def _topic(self, name: str, msgtype: str) -> Any:
         from cyclonedds.topic import Topic
 
+        find_type(msgtype, self.network.distro)
         topic = Topic(self._participant, name, sample_class(msgtype))
         self._entities.append(topic)
         return topic

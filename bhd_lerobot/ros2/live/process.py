@@ -28,7 +28,7 @@ from bhd_lerobot.ros2.live.node import Node, Publisher, Received
 from bhd_lerobot.ros2.live.spec import NodeSpec, silence_text
 from bhd_lerobot.ros2.messages.images import decode_image
 from bhd_lerobot.ros2.messages.parts import head_stamps
-from bhd_lerobot.ros2.messages.scan import ScanReader, static_frames, static_topics
+from bhd_lerobot.ros2.messages.scan import ScanReader, static_frames, static_of, static_topics
 from bhd_lerobot.ros2.messages.views import TF
 
 _WAIT_S = 0.05  # the longest without a sign of life
@@ -143,6 +143,7 @@ class Receiver:
         self._scanners = {one.topic: one.reader for one in spec.inputs if isinstance(one.reader, ScanReader)}
         frames = sorted({name for scan in self._scanners for name in static_topics(scan)})
         self._frames = [node.subscription(name, TF, Qos(100, transient_local=True)) for name in frames]
+        self._static: dict[str, dict[str, Any]] = {name: {} for name in frames}
         self._frame_senders: set[int] = set()
         self._images_ns = [0] * len(self._cameras)
         self._others: set[str] = set()
@@ -159,8 +160,9 @@ class Receiver:
         for subscription in self._frames:
             for received in subscription.take():
                 self._frame_senders.add(received.sender)
-                for scanner in self._scanners.values():
-                    scanner.static |= static_frames([received.data])[0]
+                self._static[subscription.topic] |= static_frames([received.data])[0]
+                for topic, scanner in self._scanners.items():
+                    scanner.static = static_of(topic, self._static)
         for subscriptions, indices in zip(self._subscriptions, self._inputs.values(), strict=True):
             arrived = [received for subscription in subscriptions for received in subscription.take()]
             for received in sorted(arrived, key=lambda one: one.sent_ns) if len(subscriptions) > 1 else arrived:
@@ -420,7 +422,9 @@ def _run_guard(spec: NodeSpec, channel: Channel, connection: Connection) -> None
 def main() -> int:
     """Run the process; return its exit status."""
     role, pipe, memory, wake = sys.argv[1], *(int(text) for text in sys.argv[2:5])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C is for the process that uses this one; at a shutdown all are asked to end, and the robot has to be stopped.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     connection = Connection(pipe)
     try:
         spec: NodeSpec = connection.recv()

@@ -168,9 +168,14 @@ def static_frames(messages: Sequence[bytes]) -> tuple[dict[str, tuple[str, Array
     return frames, lost
 
 
-def static_topics(scan: str) -> set[str]:
-    """Return the topics that may say how the scanner is mounted: of all robots, and of the scan's namespace."""
-    return {"/tf_static", f"{scan.rpartition('/')[0]}/tf_static"}
+def static_topics(scan: str) -> tuple[str, str]:
+    """Return the topics that may say how the scanner is mounted: that of all robots, and what counts more, its own."""
+    return "/tf_static", f"{scan.rpartition('/')[0]}/tf_static"
+
+
+def static_of(scan: str, static: Mapping[str, Static]) -> dict[str, tuple[str, Array]]:
+    """Return the transforms that count for a scanner, of those by their topics."""
+    return {frame: place for name in static_topics(scan) for frame, place in static.get(name, {}).items()}
 
 
 @dataclass

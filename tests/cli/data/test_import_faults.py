@@ -263,21 +263,26 @@ def test_a_bag_without_messages_is_refused(tmp_path, capsys):
     assert "no message of /scan" in refused(tmp_path / "silent", tmp_path / "d", capsys)
 
 
-def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
+def mounted(z, w):
+    """Return a message of `/tf_static` that says how the scanner is turned."""
     types = bags.T
     still = types["geometry_msgs/msg/TransformStamped"](
         header=bags.header(START, "tb3_1/base_link"),
         child_frame_id="tb3_1/laser",
         transform=types["geometry_msgs/msg/Transform"](
-            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=bags.Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+            translation=bags.Vector(x=0.0, y=0.0, z=0.1), rotation=bags.Quaternion(x=0.0, y=0.0, z=z, w=w)
         ),
     )
+    return ("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=[still]))
+
+
+def test_a_robot_in_a_namespace(tmp_path, messages, plain, capsys):
+    """What another robot without one states of a frame of the same name does not count."""
     named = changed(messages, "/scan", lambda at: bags.scan(at - 5 * 10**6, frame="tb3_1/laser"))
     named = changed(named, "/odom", lambda at: bags.odometry(at, child="tb3_1/base_footprint"))
-    named = [("/tf_static", START, types["tf2_msgs/msg/TFMessage"](transforms=[still])), *named]
-    named = [(f"/tb3_1{topic}", at, message) for topic, at, message in named]
+    named = [(f"/tb3_1{topic}", at, message) for topic, at, message in [mounted(1.0, 0.0), *named]]
     topics = [f"--{role}=/tb3_1/{topic}" for role, topic in (("scan", "scan"), ("odom", "odom"), ("cmd", "cmd_vel"))]
-    assert run(write(tmp_path / "bag", named), tmp_path / "d", *topics) == 0
+    assert run(write(tmp_path / "bag", [*named, mounted(0.0, 1.0)]), tmp_path / "d", *topics) == 0
     assert "turned by 180.0 degrees, from /tf_static" in capsys.readouterr().err
 
 

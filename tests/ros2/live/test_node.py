@@ -12,6 +12,7 @@ import pytest
 from bhd_lerobot.ros2.live.network import SENSOR_DATA, NetworkConfig, Qos
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.types import type_store
 from tests.forks import Fork
 from tests.ros2.peer_env import Peer
 from tests.waiting import until
@@ -133,3 +134,17 @@ def test_several_publishers_of_a_topic_are_named_and_a_robot_with_its_guard_is_o
         assert node.graph.rivals({"/cmd_vel"}) == [
             "/cmd_vel has 2 publishers, brain and bridge: the newest message counts."
         ]
+
+
+CONTROLLER = "control_msgs/msg/JointTrajectoryControllerState"
+
+
+def has_the_fields_of_humble(domain: int) -> int:
+    """Return 0 if a node of Humble publishes a type as Humble defines it; in a process of its own."""
+    with Node("robot", NetworkConfig(domain, distro="humble")) as node:
+        node.publisher("/state", CONTROLLER)
+    return int("desired" not in dict(type_store().fielddefs[CONTROLLER][1]))
+
+
+def test_types_are_those_of_the_distribution_of_the_network(domain: int, tmp_path: Path) -> None:
+    assert Fork(has_the_fields_of_humble, domain, output=tmp_path / "log").wait() == 0

@@ -16,7 +16,7 @@ from bhd_lerobot.ros2.bag.importer.topics import other_form, publisher_notes, wa
 from bhd_lerobot.ros2.bag.storage.read import Bag, Messages, Topic
 from bhd_lerobot.ros2.messages.mapping import has_header
 from bhd_lerobot.ros2.messages.parts import NANO, head_stamps, header_stamps
-from bhd_lerobot.ros2.messages.scan import static_frames, static_topics
+from bhd_lerobot.ros2.messages.scan import static_frames, static_of, static_topics
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.table import JOINTS
 
@@ -81,7 +81,12 @@ def read_tracks(bag: Bag, options: ImportOptions, known: Mapping[str, Messages],
     messages = dict(known)
     if unread := ({topic.name for _, topic in wanted} | {*latched}) - known.keys():
         messages |= bag.read(unread - images, unread & images)
-    static, lost = static_frames([one for name in latched for one in messages[name].data])
+    static: dict[str, dict[str, Any]] = {}
+    lost = 0
+    for name in latched:
+        frames, unreadable = static_frames(list(messages[name].data))
+        static.setdefault(f"/{name.lstrip('/')}", {}).update(frames)
+        lost += unreadable
     if lost:
         bag.problems.append(f"{bag.path.name}: {lost} messages of /tf_static cannot be read, and are left out")
     tracks: list[Track] = []
@@ -104,7 +109,8 @@ def read_tracks(bag: Bag, options: ImportOptions, known: Mapping[str, Messages],
             )
         clocks[topic.name] = (found.received, times)
         try:
-            values = source.readers[topic.msgtype](Reading(topic.name, found, content, static, lost > 0, notes))
+            mounted = static_of(f"/{topic.name.lstrip('/')}", static)
+            values = source.readers[topic.msgtype](Reading(topic.name, found, content, mounted, lost > 0, notes))
         except DatasetError as error:
             raise DatasetError(f"{bag.path}: {error}") from error
         track = Track(source, topic.name, topic.msgtype, times, found.order, values, stamps, source.names)
