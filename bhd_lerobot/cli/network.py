@@ -47,5 +47,5 @@ def node_of(options: argparse.Namespace) -> Node:
     network = NetworkConfig(options.domain, options.interface, list(options.peers), options.distro)
     node = Node("bhd_ros2", network)
     if getattr(options, "map", None) is not None:
-        register_types(MappingConfig.load(options.map.expanduser()).types)
+        register_types(MappingConfig.load(options.map).types)
     return node

@@ -13,6 +13,7 @@ from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
 from bhd_lerobot.ros2.messages.types import type_store, unknown_type
 
 _BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags' Nodetype; what remains is a sequence
+_WHOLE = {"char": "uint8", "octet": "uint8"}  # other types of whole numbers have numpy's names
 _STEP = re.compile(r"(?P<name>[A-Za-z]\w*)(?:\[(?:(?P<index>\d+)|(?P<key>[A-Za-z]\w*)=(?P<value>.+))\])?")
 
 
@@ -92,13 +93,15 @@ class Field:
     def put(self, tree: dict[str, Any], value: float | NDArray[np.float64]) -> None:
         """Set the value in a tree of fields, as `encode` takes it; other elements of an array are 0.
 
+        A whole number, or a truth value, becomes the nearest that its type has.
+
         Args:
             value: of one message, or where it is a number, of n messages, shape (n,).
         """
         *path, last = self._resolved[0]
         for step in path:
             tree = _child(tree, step)
-        values = np.atleast_1d(np.asarray(value, np.float64))
+        values = self._typed(np.atleast_1d(np.asarray(value, np.float64)))
         if last.index is None and not last.key:
             tree[last.name] = values[None] if self.kind == "array" else values
             return
@@ -114,9 +117,16 @@ class Field:
         grown[:, place] = values
         tree[last.name] = grown
 
+    def _typed(self, values: NDArray[np.float64]) -> NDArray[Any]:
+        kind = _WHOLE.get(self._resolved[2], self._resolved[2])
+        if kind.startswith("float"):
+            return values
+        low, high = (0, 1) if kind == "bool" else (int(np.iinfo(kind).min), int(np.iinfo(kind).max))
+        return np.array([min(max(round(one), low), high) for one in values.tolist()], kind)
+
     @cached_property
-    def _resolved(self) -> tuple[list[_Step], str]:
-        """Return the steps, and the kind of what they lead to."""
+    def _resolved(self) -> tuple[list[_Step], str, str]:
+        """Return the steps, the kind of what they lead to, and the type of its numbers, or of the message."""
         store, inside, steps = type_store(), self.msgtype, []
         if inside not in store.fielddefs:
             raise ConfigError(unknown_type(inside, store.fielddefs))
@@ -155,7 +165,8 @@ class Field:
                     f"{self.path}: {match['name']} of {inside} is an array of messages: name one, as in name[0]."
                 )
             else:
-                return steps, element[1] if is_message else "array" if is_list and not selects else "number"
+                kind = element[1] if is_message else "array" if is_list and not selects else "number"
+                return steps, kind, element[1] if is_message else element[1][0]
         raise ConfigError(
             f"A field of {self.msgtype} is missing; it has: {', '.join(dict(store.fielddefs[inside][1]))}."
         )

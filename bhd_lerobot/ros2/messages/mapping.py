@@ -108,7 +108,7 @@ class MappingConfig:
             ConfigError: it cannot be read, or has other keys.
         """
         try:
-            tree = yaml.safe_load(Path(path).read_text())
+            tree = yaml.safe_load(Path(path).expanduser().read_text("utf-8"))
         except OSError as error:
             raise ConfigError(f"The mapping {path} cannot be read: {error.strerror}.") from error
         except (UnicodeDecodeError, yaml.YAMLError) as error:
@@ -152,10 +152,19 @@ def _entry(where: str, kind: Any, entry: Any) -> Any:
     missing = [one.name for one in fields(kind) if one.default is MISSING and one.name not in entry]
     if missing:
         raise ConfigError(f"{where} has no {' and no '.join(missing)}.")
+    values = {}
     try:
-        return kind(**{key: float(value) if key in ("scale", "offset") else value for key, value in entry.items()})
+        for one in fields(kind):
+            if one.name in entry:
+                values[one.name] = value = float(entry[one.name]) if one.type is float else entry[one.name]
+                if not isinstance(value, one.type) or isinstance(value, bool):  # type: ignore[arg-type]
+                    raise ConfigError(f"{one.name} is {value!r}; it is {_WORDS[one.type]}.")
+        return kind(**values)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: {error}") from error
+
+
+_WORDS: dict[Any, str] = {str: "text", int: "a whole number"}
 
 
 @dataclass(frozen=True)

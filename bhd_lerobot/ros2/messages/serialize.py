@@ -94,15 +94,15 @@ def decode(msgtype: str, data: bytes) -> Any:
     if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1):
         raise DatasetError(
             f"A message of type {msgtype} is not serialised as plain CDR: it begins with {data[:4].hex(' ')!r}, where "
-            "00 00 or 00 01 was expected. Either a plug-in of the recorder has compressed it, in a way that is not "
-            "known here (ros2 bag convert removes it), or the ROS 2 middleware that was recorded does not write CDR."
+            "00 00 or 00 01 was expected. The ROS 2 middleware of its sender does not write CDR; or in a bag, a "
+            "plug-in of the recorder has compressed it, in a way that is not known here (ros2 bag convert removes it)."
         )
     try:
         return type_store().deserialize_cdr(data, msgtype)
     except Exception as error:  # whatever a parser of damaged bytes raises
         raise DatasetError(
-            f"A message of {len(data)} bytes cannot be read as {msgtype}: {error} The topic's type in the bag is not "
-            "that of its messages, or the bag is damaged."
+            f"A message of {len(data)} bytes cannot be read as {msgtype}: {error} Its sender has another definition of "
+            "this type, or in a bag, the topic's type is not that of its messages, or the bag is damaged."
         ) from error
 
 

@@ -114,6 +114,11 @@ class Ros2Robot(Robot):
         names = [self._actions[column] for column in topic.columns]
         if not any(name in self.config.stop for name in names) and not all(name.endswith(".vel") for name in names):
             return None
+        if missing := [name for name in names if name not in self.config.stop and not name.endswith(".vel")]:
+            raise ConfigError(
+                f"robot.stop has no {' and no '.join(missing)}, which is no speed and goes to {topic.topic} in the "
+                f"same message: it would be sent as 0. Set --robot.stop.{missing[0]}, too."
+            )
         return tuple(self.config.stop.get(name, 0.0) for name in names)
 
     @cached_property

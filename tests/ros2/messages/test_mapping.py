@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.ros2.messages.mapping import FieldConfig, MappingConfig, has_header, register_types, topics_of
 from bhd_lerobot.ros2.messages.serialize import decode
+from tests.cases import each_case
 
 ODOMETRY, JOINTS = "nav_msgs/msg/Odometry", "sensor_msgs/msg/JointState"
 
@@ -58,6 +60,26 @@ def test_a_topic_of_two_types_is_named() -> None:
         topics_of(two, {})
 
 
+@pytest.mark.law
+@each_case(
+    ("msgtype", "field", "value", "sent"),
+    [
+        ("Int32", "data", 2.6, 3),
+        ("UInt8", "data", -4.0, 0),
+        ("UInt8", "data", 300.0, 255),
+        ("UInt64", "data", 1e30, 2**64 - 1),
+        ("Bool", "data", 0.3, False),
+        ("Bool", "data", 0.8, True),
+        ("Int16MultiArray", "data[0]", -1.7, -2),
+        ("Float32", "data", 0.5, 0.5),
+    ],
+)
+def test_a_whole_number_or_a_truth_value_is_sent_as_the_nearest_that_there_is(msgtype, field, value, sent):
+    [topic] = topics_of({"grip.pos": FieldConfig("/grip", f"std_msgs/msg/{msgtype}", field)}, {})
+    message = decode(topic.msgtype, topic.encode(np.array([value]), 0))
+    assert topic.fields[0].read(message) == sent
+
+
 YAML = """
 observation:
   x.vel: {topic: /odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}
@@ -72,14 +94,30 @@ types:
 """
 
 
-def test_a_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "robot.yaml"
-    path.write_text(YAML)
-    mapping = MappingConfig.load(path)
+def test_a_file_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "robot.yaml").write_text(YAML)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    mapping = MappingConfig.load("~/robot.yaml")  # which a shell leaves as it is behind --robot.mapping=
     assert list(mapping.observation) == ["x.vel", "load"]
     assert mapping.images["front"].type == "sensor_msgs/msg/CompressedImage"
     _, load = topics_of(mapping.observation, mapping.types)
     assert load.read(decode(load.msgtype, load.encode(np.array([3.0]), 0))) == [3.0]
+
+
+@each_case(
+    ("wrong", "text"),
+    [
+        ("topic:", "x.vel: topic is None; it is text"),
+        ("topic: /odom, type: 5", "x.vel: type is 5; it is text"),
+        ("topic: /odom, field: [twist]", "x.vel: field is .*; it is text"),
+        ("topic: /odom, scale:", "x.vel: float"),
+        ("topic: /scan, beams: 8.0", "x.vel: beams is 8.0; it is a whole number"),
+    ],
+)
+def test_a_value_that_is_missing_or_of_another_kind_is_named(wrong: str, text: str) -> None:
+    entry = {"type": ODOMETRY} | yaml.safe_load(f"{{{wrong}}}")
+    with pytest.raises(ConfigError, match=text):
+        MappingConfig.of({"observation": {"x.vel": entry}}, "robot.yaml")
 
 
 def test_a_type_has_one_definition() -> None:

@@ -31,6 +31,11 @@ action:
   x.vel: {{topic: /cmd_vel, {TWIST}, field: twist.linear.x}}
   theta.vel: {{topic: /cmd_vel, {TWIST}, field: twist.angular.z}}
 """
+MIXED = """
+action:
+  x.vel: {topic: /commands, type: std_msgs/msg/Float64MultiArray, field: "data[0]"}
+  lift.pos: {topic: /commands, type: std_msgs/msg/Float64MultiArray, field: "data[1]"}
+"""
 FORWARD = {"x.vel": 0.1, "theta.vel": 0.0}
 
 
@@ -132,6 +137,11 @@ def test_stock_lerobot_record(tmp_path: Path, domain: int) -> None:
     [
         (MAPPING + "images: {front: {topic: /image}}", {}, "images.front has no width and height"),
         (MAPPING, {"stop": {"y.vel": 0.0}}, "Did you mean 'x.vel'"),
+        (
+            MIXED,
+            {"stop": {"x.vel": 0.0}},
+            r"robot.stop has no lift.pos, .* /commands .* Set --robot.stop.lift.pos, too",
+        ),
     ],
 )
 def test_a_mapping_that_cannot_be_used_is_refused(tmp_path, text, options, message):
