@@ -13,6 +13,8 @@ _DOMAINS = 233  # the ports of further ones lie beyond 65535
 _MOST_KEPT = 10_000
 _ADDRESS = re.compile(r"[\w.:%-]+")
 DISTROS = ("humble", "jazzy")
+WHEEL_SPEEDS = ("m/s", "rad/s")
+Domain = Annotated[int, Range(f"[0, {_DOMAINS - 1}]")]
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class NetworkConfig(Options):
         distro: whose interfaces are used where distributions differ: ``jazzy`` (and later) or ``humble``.
     """
 
-    domain: Annotated[int, Range(f"[0, {_DOMAINS - 1}]")] | None = None
+    domain: Domain | None = None
     interface: str = "lo"
     peers: list[str] = field(default_factory=list)
     distro: Annotated[str, OneOf(DISTROS)] = "jazzy"
@@ -99,6 +101,8 @@ class Ros2Config(NetworkConfig, prefix="robot.ros2."):
         namespace: in front of the robot's topics, such as ``/tb3_1``.
         scan_frame: the frame of scans, where ``/tf_static`` does not state how the scanner is mounted.
         scan_yaw: where the scanner's zero points [rad], 0 is straight ahead; by default as ``/tf_static`` states.
+        wheel_speeds: unit of a base's speeds in ``/joint_states``: ``m/s``, as the TurtleBot3's own node has them, or
+            ``rad/s``, as ROS defines them, and Gazebo has them.
     """
 
     command_hz: NotNegative = 0.0
@@ -109,6 +113,7 @@ class Ros2Config(NetworkConfig, prefix="robot.ros2."):
     namespace: str = ""
     scan_frame: str = "base_scan"
     scan_yaw: Finite | None = None
+    wheel_speeds: Annotated[str, OneOf(WHEEL_SPEEDS)] = WHEEL_SPEEDS[0]
 
     @property
     def silent_s(self) -> float:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body, Drive, LidarSpec
 from bhd_lerobot.control.plant import PlantReading
+from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.spec import InputSpec, OutputSpec
 from bhd_lerobot.ros2.messages.presets import columns
@@ -25,6 +26,7 @@ from bhd_lerobot.ros2.robots.plant import Ros2Plant, scan_reader
 _STOP = (0.0, 0.0)
 _NODE_SILENCE_S = 0.5  # of topics at 20 Hz
 _SCAN_SILENCE_S = 1.0  # of scans at 5 Hz
+_FASTER = 2.0  # times the wheels' largest speed, which none is
 
 
 class BasePlant(Ros2Plant):
@@ -43,6 +45,7 @@ class BasePlant(Ros2Plant):
         beams = config.beams
         self._beams, self._has_gyro = beams, config.imu
         self._half_track, self._wheel_radius = drive.wheel_separation / 2, drive.wheel_radius
+        self._unit, self._fastest = config.ros2.wheel_speeds, _FASTER * drive.max_wheel_speed
         node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
         twist_type = TWIST_TYPE if config.ros2.distro == "humble" else STAMPED_TWIST
         inputs = [
@@ -74,7 +77,12 @@ class BasePlant(Ros2Plant):
         """Write the wheels, the scan and the gyroscope into `out`."""
         wheels = self.numbers(state, 0)
         out.position[0] = wheels[:2]
-        out.velocity[0] = wheels[2:] / self._wheel_radius
+        out.velocity[0] = wheels[2:] / (self._wheel_radius if self._unit == "m/s" else 1.0)
+        if (fastest := np.abs(out.velocity[0]).max()) > self._fastest:
+            raise RealtimeError(
+                f"A wheel turns at {fastest:.0f} rad/s by {self.link.spec.inputs[0].topic}, whose speeds are taken for "
+                f"{self._unit}; none is faster than {self._fastest:.0f}. Gazebo needs --robot.ros2.wheel_speeds=rad/s."
+            )
         out.sensors[0, : self._beams] = self.numbers(state, 1)
         if self._has_gyro:
             out.sensors[0, self._beams :] = self.numbers(state, 2)

@@ -6,7 +6,7 @@ from lerobot.robots.config import RobotConfig
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Positive, check_options
-from bhd_lerobot.ros2.live.network import Ros2Config
+from bhd_lerobot.ros2.live.network import WHEEL_SPEEDS, Ros2Config
 
 
 @RobotConfig.register_subclass("ros2")
@@ -38,5 +38,10 @@ class Ros2RobotConfig(RobotConfig):
             raise ConfigError(
                 f"robot.ros2.latency_s is {self.ros2.latency_s}; it is of robots with --robot.plant=ros2. Whether a "
                 "robot of the type ros2 follows its commands is not supervised."
+            )
+        if self.ros2.wheel_speeds != WHEEL_SPEEDS[0]:
+            raise ConfigError(
+                f"robot.ros2.wheel_speeds is {self.ros2.wheel_speeds!r}; it is of robots with --robot.plant=ros2. For "
+                "the robot type ros2 set `scale` in the mapping."
             )
         check_options(self, "robot.")

@@ -3,17 +3,21 @@
 import signal
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.plant import PlantReading, SafetyStatus
-from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.errors import ConfigError, RealtimeError
 from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.ros2.messages import ur
 from bhd_lerobot.ros2.robots.arm_plant import ArmPlant
+from tests.cases import each_case
 from tests.ros2.feed import JOINTS, Sent, feed, head
 from tests.ros2.peer_env import Peer, environment
 from tests.waiting import until
@@ -84,3 +88,24 @@ def test_the_safety_mode_is_read_of_drivers_that_keep_it_and_of_those_that_do_no
     with feed(domain, make, hz=125, receives=((ur.POSITION_TOPIC, ur.FLOATS),), kept=kept):
         plant.open()
         until(lambda: [plant.read(out), out.safety[0] == SafetyStatus.STOPPED][1], "the stop is noticed")
+
+
+def test_an_arm_without_a_gripper_is_read_and_commanded(domain: int) -> None:
+    body = replace(ur5(), arm=replace(ur5().need(Arm), gripper=None))
+    plant: Any = ArmPlant(SimpleNamespace(ros2=Ros2Config(domain=domain)), body)
+    assert [one.topic for one in plant.link.spec.outputs] == [ur.POSITION_TOPIC]
+    sent: list[np.ndarray] = []
+    plant.link = SimpleNamespace(write=sent.append)
+    plant.enable()
+    plant.write(np.arange(6.0)[None])
+    assert [values.tolist() for values in sent] == [list(range(6))]
+    out = PlantReading(1, 6)
+    plant.read_parts({"values": np.append(np.arange(12.0), [100.0, 1.0]), "measured_ns": np.zeros(3)}, out)
+    assert out.position.tolist() == [list(range(6))]
+    assert out.velocity.tolist() == [list(range(6, 12))]
+
+
+@each_case("option", [{"scan_yaw": 0.1}, {"wheel_speeds": "rad/s"}])
+def test_an_option_of_a_base_is_refused(option: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"robot.ros2.{next(iter(option))} is .*; an arm has no"):
+        ArmPlant(SimpleNamespace(ros2=Ros2Config(**option)), ur5())

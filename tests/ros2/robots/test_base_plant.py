@@ -133,6 +133,14 @@ def test_it_stops_when_the_node_is_killed_or_stopped(robot: Peer, plant: BasePla
         os.kill(plant.link.pids["node"], signal.SIGCONT)
 
 
+def test_the_robot_is_stopped_when_all_processes_are_asked_to_end_at_once(robot: Peer, plant: BasePlant) -> None:
+    """As at a shutdown of the computer: what commands the robot ends, and its node stops it."""
+    drive(plant, lambda: moves(robot), "the robot moves")
+    for pid in plant.link.pids.values():
+        os.kill(pid, signal.SIGTERM)
+    until(lambda: stands(robot), "the robot stands")
+
+
 def test_another_robot_of_its_name_another_node_that_commands_it_and_a_guard_that_is_gone_are_faults(plant, shared):
     def is_well() -> bool:
         return not plant.link.problem
@@ -251,6 +259,22 @@ def test_a_namespace_and_another_scanner() -> None:
     reader = plant.link.spec.inputs[1].reader
     assert isinstance(reader, ScanReader)
     assert (reader.topic, reader.frame) == ("/tb3_1/scan", "laser")
+
+
+@pytest.mark.law
+def test_wheels_speeds_have_the_unit_that_is_stated_and_a_wrong_one_is_named() -> None:
+    """Those of turtlebot3_node are in m/s, those of Gazebo in rad/s."""
+
+    def read(unit: str, speed: float) -> float:
+        out = PlantReading(1, 2, 360)
+        values = np.array([1.0, 2.0, speed, -speed, *np.ones(360)])
+        make(1, imu=False, wheel_speeds=unit).read_parts({"values": values, "measured_ns": np.zeros(2)}, out)
+        assert out.velocity[0, 1] == -out.velocity[0, 0]
+        return float(out.velocity[0, 0])
+
+    assert read("m/s", 0.1) == pytest.approx(read("rad/s", 0.1 / 0.033)) == pytest.approx(0.1 / 0.033)
+    with pytest.raises(RealtimeError, match=r"A wheel turns at 92 rad/s by /joint_states, .*wheel_speeds=rad/s"):
+        read("m/s", 0.1 / 0.033)
 
 
 @each_case(

@@ -64,7 +64,9 @@ def test_a_namespace_is_in_front_of_every_topic(tmp_path: Path, domain: int) -> 
             ("/tb3_1/scan", SCAN, scan(RANGES)),
         ],
         receives=(("/tb3_1/cmd_vel", TWIST), ("/cmd_vel", TWIST)),
-        frames=(("/tb3_1/tf_static", mounted("base_scan", math.pi / 2)),),
+        frames=tuple(
+            (f"{name}/tf_static", mounted("base_scan", yaw)) for name, yaw in (("/tb3_1", math.pi / 2), ("", 3.0))
+        ),
     )
     observed = {"x.vel": SPEED, "scan": SCANNER}
     with feeding as received, connected(tmp_path, observed, domain=domain, namespace="tb3_1/") as robot:
@@ -88,6 +90,7 @@ def test_a_namespace_is_in_front_of_images_and_of_topics_without_a_slash(tmp_pat
         ({"silence_s": 0.5}, r"robot.ros2.silence_s is 0.5;.*--robot.topic_timeout_s=0.5"),
         ({"latency_s": 0.1}, "robot.ros2.latency_s is 0.1; it is of robots with --robot.plant=ros2"),
         ({"scan_yaw": 0.1}, "robot.ros2.scan_yaw is 0.1; .* has no scan"),
+        ({"wheel_speeds": "rad/s"}, r"robot.ros2.wheel_speeds is 'rad/s'; .*`scale`"),
     ],
 )
 def test_an_option_that_would_not_act_is_refused(tmp_path: Path, network: dict[str, Any], message: str) -> None:
