@@ -15,10 +15,11 @@ from bhd_lerobot.ros2.live.network import Ros2Config
 from bhd_lerobot.sim.lidar import check_beams
 
 _ROS2 = Ros2Config()
-_ROS2_PLANTS = {
+ROS2_PLANTS = {
     True: "bhd_lerobot.ros2.robots.base_plant:BasePlant",
     False: "bhd_lerobot.ros2.robots.arm_plant:ArmPlant",
 }
+"""The plants of ``plant = "ros2"``, of a base and of an arm."""
 
 
 @dataclass(kw_only=True)
@@ -74,7 +75,7 @@ class BhdRobotConfig(RobotConfig):
                     "arm on a base. Drive it by --robot.type=ros2 with a mapping of its topics, or name a class of "
                     "your own, --robot.plant=package.module:Class."
                 )
-            self.plant = _ROS2_PLANTS[body.drive is not None]
+            self.plant = ROS2_PLANTS[body.drive is not None]
             self.clock = "realtime"
             timeout_s = max(self.realtime.plant_timeout_s, self.ros2.silent_s)
             brain_s = self.realtime.brain_timeout_s

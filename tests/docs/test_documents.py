@@ -54,7 +54,7 @@ def test_the_reference_is_up_to_date() -> None:
     files = folder / "options.md", folder / "record.md", *(folder / "options").iterdir()
     written = {path: path.read_text(encoding="utf-8") for path in files}
     assert written == pages, "run: python scripts/make_reference.py"
-    assert sum(len(text.splitlines()) for text in pages.values()) <= 1310
+    assert sum(len(text.splitlines()) for text in pages.values()) <= 1320
 
 
 def test_an_option_without_a_description_is_found() -> None:

@@ -69,9 +69,9 @@ class Program:
 
         until(printed, f"{text!r} is printed")
 
-    def stop(self) -> int:
-        """End it by SIGINT; return its exit status."""
-        self.process.send_signal(signal.SIGINT)
+    def stop(self, number: int = signal.SIGINT) -> int:
+        """End it by a signal; return its exit status."""
+        self.process.send_signal(number)
         return self.process.wait()
 
 

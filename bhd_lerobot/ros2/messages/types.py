@@ -12,6 +12,8 @@ from typing import Any
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, install_extra
 
+_BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags' Nodetype; what remains is a sequence
+
 FORMAT = 2
 """Version of the messages below."""
 
@@ -181,3 +183,12 @@ def unknown_type(name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(name, list(known), n=4, cutoff=0.5)
     hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
     return f"Unknown ROS 2 type {name!r}.{hint} The section `types` of a mapping defines further ones, by their text."
+
+
+def type_text(description: Any) -> str:
+    """Return the type of a field, by `rosbags`' description of it, in ROS's message language, without bounds."""
+    kind, inner = int(description[0]), description[1]
+    if kind in (_BASE, _NAME):
+        return str(inner[0] if kind == _BASE else inner)
+    element, count = inner
+    return f"{type_text(element)}[{count if kind == _ARRAY else ''}]"

@@ -4,6 +4,7 @@ What differs from the real ones is in docs/how_to/ros2.md, "Differences".
 """
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -40,18 +41,20 @@ class ArmTopics(Topics):
         self._count = len(self._names)
         self._command: NDArray[np.float64] = host.bridge.state().command  # joints, then the gripper
         self._motion: _Motion | None = None  # what is followed
-        self._next: tuple[Any, int] | None = None  # the trajectory that takes its place, and when [ns]
+        self._next: tuple[Any, int, str] | None = None  # the trajectory that takes its place, when [ns], and its topic
         self._period_ns = NANOSECONDS // host.rates.fps
         self._sent_ns = 0
         self._joint_states = node.publisher("/joint_states", JOINTS)
         self._scaling = node.publisher(ur.SCALING_TOPIC, ur.FLOAT)
         self._transforms = node.publisher("/tf", views.TF, Qos(100))
         self._static = node.publisher("/tf_static", views.TF, LATCHED)
-        self.inputs = [
-            Input(node.subscription(ur.TRAJECTORY_TOPIC, ur.TRAJECTORY), self.follow),
-            Input(node.subscription(ur.POSITION_TOPIC, ur.FLOATS), self._move),
-            Input(node.subscription(ur.GRIPPER_TOPIC, ur.FLOATS), self._grip),
+        commands: list[tuple[str, str, Callable[[Any], bool]]] = [
+            (ur.TRAJECTORY_TOPIC, ur.TRAJECTORY, self.follow),
+            (ur.POSITION_TOPIC, ur.FLOATS, self._move),
         ]
+        if host.body.need(Arm).gripper is not None:
+            commands.append((ur.GRIPPER_TOPIC, ur.FLOATS, self._grip))
+        self.inputs = [Input(node.subscription(topic, msgtype), take) for topic, msgtype, take in commands]
         [full_speed] = encode(ur.FLOAT, {"data": 100.0}, 1)
         self.outputs = [
             Output(joint_states_hz, self._publish),
@@ -88,7 +91,7 @@ class ArmTopics(Topics):
 
     # --- commands ----------------------------------------------------------------------------------------------------
 
-    def follow(self, message: Any) -> bool:
+    def follow(self, message: Any, topic: str = ur.TRAJECTORY_TOPIC) -> bool:
         """Take a trajectory. Its stamp is its start, 0 is at once; until then what is followed goes on."""
         now = time.monotonic_ns()
         [stamp] = header_stamps([message]).tolist()
@@ -96,15 +99,13 @@ class ArmTopics(Topics):
         try:
             trajectory = self._trajectory(message, now - start_ns)
         except ActionError as error:
-            return self._refuse(ur.TRAJECTORY_TOPIC, str(error))
+            return self._refuse(topic, str(error))
         if start_ns > now:
-            self._next = message, start_ns
+            self._next = message, start_ns, topic
             waits_s = (start_ns - now) / NANOSECONDS
-            self._counts.note(
-                "waiting", f"{ur.TRAJECTORY_TOPIC}: by its stamp the trajectory starts in {waits_s:.3g} s"
-            )
+            self._counts.note("waiting", f"{topic}: by its stamp the trajectory starts in {waits_s:.3g} s")
         else:
-            self._motion, self._next = _Motion(ur.TRAJECTORY_TOPIC, trajectory, start_ns), None
+            self._motion, self._next = _Motion(topic, trajectory, start_ns), None
         return True
 
     def _refuse(self, topic: str, reason: str) -> bool:
@@ -146,12 +147,12 @@ class ArmTopics(Topics):
         """Send the present setpoint of what is followed; return when the next one is due [ns]."""
         robot = self._host.bridge.state()
         if self._next is not None:
-            message, start_ns = self._next
+            message, start_ns, topic = self._next
             if mode_reason(Mode(int(robot.mode[0]))) != Reason.ACCEPTED:
                 self._next = None
-                self._counts.add(f"{ur.TRAJECTORY_TOPIC}: the arm was stopped before the trajectory's start")
+                self._counts.add(f"{topic}: the arm was stopped before the trajectory's start")
             elif now_ns >= start_ns:
-                self._motion, self._next = _Motion(ur.TRAJECTORY_TOPIC, self._trajectory(message, 0), start_ns), None
+                self._motion, self._next = _Motion(topic, self._trajectory(message, 0), start_ns), None
         following_ns = NEVER_NS if self._next is None else self._next[1]
         motion = self._motion
         if motion is None:

@@ -16,7 +16,8 @@ from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.definitions import register_types
 from bhd_lerobot.ros2.messages.parts import header
 from bhd_lerobot.ros2.messages.serialize import encode_known
-from bhd_lerobot.ros2.messages.types import type_store
+from bhd_lerobot.ros2.messages.types import type_store, type_text
+from bhd_lerobot.ros2.messages.ur import TRAJECTORY
 from bhd_lerobot.ros2.serve.interface import Names
 from bhd_lerobot.ros2.serve.server import Input, Output, State, Topics
 
@@ -32,6 +33,33 @@ _FIELDS = {
     "command": ("task_id", "target_pose"),
     "result": ("task_id", "success"),
     "state": ("joint_positions", "joint_velocities"),
+}
+_NUMBER, _NUMBERS = ("float64", "float32"), ("float64[]", "float32[]")
+# What is read and written of each, where it is there, and of which types it may be.
+_USED: dict[str, dict[str, tuple[str, ...]]] = {
+    "command": {
+        "header": ("std_msgs/msg/Header",),
+        "task_id": ("string",),
+        "target_pose": ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped"),
+        "max_velocity": _NUMBER,
+        "max_acceleration": _NUMBER,
+    },
+    "result": {
+        "header": ("std_msgs/msg/Header",),
+        "stamp": ("builtin_interfaces/msg/Time",),
+        "task_id": ("string",),
+        "success": ("bool",),
+        "message": ("string",),
+    },
+    "state": {
+        "header": ("std_msgs/msg/Header",),
+        "stamp": ("builtin_interfaces/msg/Time",),
+        "joint_positions": _NUMBERS,
+        "joint_velocities": _NUMBERS,
+        "joint_efforts": _NUMBERS,
+        "is_moving": ("bool",),
+        "emergency_stop": ("bool",),
+    },
 }
 
 
@@ -73,9 +101,16 @@ def _package(folder: Path) -> tuple[str, dict[str, str]]:
 def _find(role: str, package: str, texts: dict[str, str], articles: bool | str) -> str:
     wanted = _FIELDS[role]
     for name in texts:
-        known = {field for field, _ in type_store().fielddefs[f"{package}/msg/{name}"][1]}
-        if known.issuperset(wanted):
-            return f"{package}/msg/{name}"
+        known = dict(type_store().fielddefs[f"{package}/msg/{name}"][1])
+        if not known.keys() >= {*wanted}:
+            continue
+        for field, types in _USED[role].items():
+            if field in known and (kind := type_text(known[field])) not in types:
+                raise ConfigError(
+                    f"articles is {articles!r}; {field} of its message {name}, the {role}, is {kind}; it is "
+                    f"{' or '.join(types)}."
+                )
+        return f"{package}/msg/{name}"
     raise ConfigError(
         f"articles is {articles!r}; none of its messages ({', '.join(texts) or 'there are none'}) is the {role}, which "
         f"has the fields {' and '.join(wanted)}."
@@ -86,14 +121,15 @@ class TrajectoryController(Topics):
     """The topics of a `joint_trajectory_controller` in front of a served arm.
 
     Args:
-        follow: takes a trajectory; returns False if it is refused.
+        follow: takes a trajectory and its topic; returns False if it is refused.
     """
 
-    def __init__(self, host: LiveHost, node: Node, follow: Callable[[Any], bool]) -> None:
+    def __init__(self, host: LiveHost, node: Node, follow: Callable[[Any, str], bool]) -> None:
         self._joints = [f"{joint}_joint" for joint in host.body.need(Arm).chain.joints]
         self._publisher = node.publisher(CONTROLLER_TOPIC, CONTROLLER)
         self.outputs = [Output(_STATE_HZ, self._publish)]
-        self.inputs = [Input(node.subscription(TRAJECTORY_TOPIC, "trajectory_msgs/msg/JointTrajectory"), follow)]
+        received = node.subscription(TRAJECTORY_TOPIC, TRAJECTORY)
+        self.inputs = [Input(received, lambda message: follow(message, TRAJECTORY_TOPIC))]
 
     def _publish(self, state: State) -> None:
         count, robot = len(self._joints), state.robot

@@ -4,18 +4,21 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Console
 
 from bhd_lerobot.control.messages import Mode, Watchdog
 from bhd_lerobot.errors import ConfigError, RealtimeError
+from bhd_lerobot.options.declared import OneOf, Options
 from bhd_lerobot.recording.passive import PassiveRecording, RecordOptions
+from bhd_lerobot.robots.config import ROS2_PLANTS
 from bhd_lerobot.robots.host.realtime import LiveHost, mirror_of
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of, raised
-from bhd_lerobot.ros2.live.network import NetworkConfig
-from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.live.network import DISTROS, SENSOR_DATA, Domain, NetworkConfig
+from bhd_lerobot.ros2.live.node import Node, Subscription
+from bhd_lerobot.ros2.messages.table import ODOMETRY_TYPE
 from bhd_lerobot.ros2.serve import articles
 from bhd_lerobot.ros2.serve.articles import article_names
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
@@ -25,6 +28,23 @@ from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
 from bhd_lerobot.ros2.serve.setpoints import Setpoints
 
 TWIST_TOPIC, POSITION_TOPIC = "/brain/cmd_vel", "/brain/commands"
+
+
+@dataclass(frozen=True)
+class BrainNetworkConfig(Options, prefix="network."):
+    """The network of the brains in front of a bridge. What is not given is that of `robot.ros2`.
+
+    Attributes:
+        domain: number of the ROS domain.
+        interface: network interface or address; ``lo`` is the loopback interface, ``auto`` what Cyclone DDS prefers.
+        peers: addresses of further machines, for networks without multicast.
+        distro: whose interfaces are used where distributions differ: ``jazzy`` (and later) or ``humble``.
+    """
+
+    domain: Domain | None = None
+    interface: str | None = None
+    peers: list[str] | None = None
+    distro: Annotated[str, OneOf(DISTROS)] | None = None
 
 
 @dataclass
@@ -38,6 +58,7 @@ class BridgeConfig(ServiceConfig):
         record: what is recorded, and where.
     """
 
+    network: BrainNetworkConfig = field(default_factory=BrainNetworkConfig)  # type: ignore[assignment]
     record: RecordOptions = field(default_factory=RecordOptions)
 
     def __post_init__(self) -> None:
@@ -52,10 +73,9 @@ class BridgeConfig(ServiceConfig):
             robot.odometry = True  # a goal is reached by it
         elif robot.action_space != "joint":
             raise ConfigError(f"robot.action_space is {robot.action_space!r}; a bridge takes joint positions: 'joint'.")
-        usual = NetworkConfig()
-        names = [one.name for one in fields(usual)]
-        given = {name: value for name in names if (value := getattr(self.network, name)) != getattr(usual, name)}
-        self.network = NetworkConfig(**{name: getattr(robot.ros2, name) for name in names} | given)
+        given = {name: value for name, value in vars(self.network).items() if value is not None}
+        of_robot = {one.name: getattr(robot.ros2, one.name) for one in fields(NetworkConfig)}
+        self.network = NetworkConfig(**of_robot | given)  # type: ignore[assignment]
 
 
 class Faults(Topics):
@@ -85,7 +105,7 @@ class Faults(Topics):
 def bridge(
     config: BridgeConfig, simulation: type[Simulation], console: Console, ended: threading.Event | None = None
 ) -> None:
-    """Stand between brains and a robot until SIGINT or SIGTERM. The robot starts where it is, and holds.
+    """Stand between brains and a robot until SIGINT, SIGTERM or SIGHUP. The robot starts where it is, and holds.
 
     Raises:
         DatasetError: what is at `record.root` is no dataset of this robot, or cannot be written.
@@ -99,7 +119,7 @@ def bridge(
         console.print(line, markup=False, soft_wrap=True)
 
     def parts(host: LiveHost, node: Node, counts: Counts) -> list[Topics]:
-        goals: Goals = ArmGoals(host) if host.body.arm is not None else BaseGoals(host)
+        goals: Goals = ArmGoals(host) if host.body.arm is not None else BaseGoals(host, _odometry(config.robot, node))
         topics = (POSITION_TOPIC,) if host.body.arm is not None else (TWIST_TOPIC, *extra)
         if recording is not None:
             recording.begin(host)
@@ -121,6 +141,13 @@ def bridge(
             name=f"{config.robot.type}_bridge",
             title="is behind a bridge",
         )
+
+
+def _odometry(robot: Any, node: Node) -> Subscription | None:
+    """Return the odometry that a robot publishes itself; its newest message waits until it is asked for."""
+    if robot.plant != ROS2_PLANTS[True]:
+        return None
+    return node.raw_subscription(f"rt{robot.ros2.in_namespace('/odom')}", ODOMETRY_TYPE, SENSOR_DATA)
 
 
 def _recording(

@@ -1,5 +1,6 @@
 """Topics by option: images and the clock."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -22,8 +23,10 @@ _CLOCK = "rosgraph_msgs/msg/Clock"
 class CameraTopics(Topics):
     """The images of a robot's cameras, one an action: ``/camera/image_raw/compressed``, or with the camera's name."""
 
-    def __init__(self, host: LiveHost, node: Node, view: views.RobotView) -> None:
-        self._host, self._view, self._pending = host, view, 0
+    def __init__(self, host: LiveHost, node: Node) -> None:
+        self._host, self._pending = host, 0
+        model = host.world.model
+        self._fovy = {name: math.radians(model.cam_fovy[model.camera(name).id]) for name in host.camera_shapes}
         alone = len(host.camera_shapes) == 1
         prefix = {name: "/camera" if alone else f"/{name}" for name in host.camera_shapes}
         self._images = {
@@ -42,7 +45,7 @@ class CameraTopics(Topics):
         frames = state.frames
         for name, (height, width, _) in self._host.camera_shapes.items():
             frame = f"{name}_optical_frame"
-            [info] = views.camera_info(frames, frame, (height, width), self._view.fovy[name])
+            [info] = views.camera_info(frames, frame, (height, width), self._fovy[name])
             self._infos[name].send(info)
             self._pending += 1
             self._host.render_later(0, name, partial(self._deliver, self._images[name], frames, frame))

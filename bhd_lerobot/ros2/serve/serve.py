@@ -66,7 +66,7 @@ class ServeConfig(ServiceConfig):
 def serve(
     config: ServeConfig, simulation: type[Simulation], console: Console, ended: threading.Event | None = None
 ) -> None:
-    """Serve a robot until SIGINT or SIGTERM.
+    """Serve a robot until SIGINT, SIGTERM or SIGHUP.
 
     Raises:
         ConfigError: Cyclone DDS is not installed, or Foxglove cannot be served.
@@ -124,7 +124,7 @@ def _parts(config: ServeConfig, host: LiveHost, node: Node, counts: Counts, name
     if view.joints:
         publish_description(node, config.robot.type, view, parts_of(host.body))
     if host.camera_shapes:
-        parts.append(CameraTopics(host, node, view))
+        parts.append(CameraTopics(host, node))
     if config.clock:
         parts.append(ClockTopic(node))
     return parts

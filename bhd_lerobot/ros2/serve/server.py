@@ -171,7 +171,7 @@ class Server:
         }
 
     def run(self, stop: Callable[[], bool], report: Callable[[str], None]) -> None:
-        """Serve until `stop` returns true.
+        """Serve until `stop` returns true, and answer what others still wait for, also if an error ends it.
 
         Args:
             report: takes a line about what was refused, at most one a second, and about each node whose topic does not
@@ -180,6 +180,13 @@ class Server:
         Raises:
             RealtimeError: a process of the robot has ended.
         """
+        try:
+            self._serve(stop, report)
+        finally:
+            for part in self._parts:
+                part.end()
+
+    def _serve(self, stop: Callable[[], bool], report: Callable[[str], None]) -> None:
         start = time.monotonic_ns()
         for output in self._outputs:
             output.due_ns = start
@@ -211,5 +218,3 @@ class Server:
             left = (due - time.monotonic_ns()) / NANOSECONDS
             if left > 0:
                 self._node.wait(min(left, _LONGEST_WAIT_S))
-        for part in self._parts:
-            part.end()

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -73,7 +74,7 @@ def run_service(
     node: Callable[..., Node] = Node,
     view: bool = False,
 ) -> Any:
-    """Run a robot and its topics until SIGINT or SIGTERM; return the robot's last state.
+    """Run a robot and its topics until SIGINT, SIGTERM or SIGHUP; return the robot's last state.
 
     Args:
         scene: in which it starts; None: where it is.
@@ -84,9 +85,16 @@ def run_service(
     """
     require_cyclonedds()
     end, robot = ended or threading.Event(), config.robot
+    is_shown = console.is_terminal
+
+    def stop(number: int, _: FrameType | None) -> None:
+        end.set()
+        console.quiet |= is_shown and number == signal.SIGHUP  # the terminal is gone: it takes nothing any more
+
     with ExitStack() as running:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            running.callback(signal.signal, number, signal.signal(number, lambda *_: end.set()))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as it is by nohup
+                running.callback(signal.signal, number, signal.signal(number, stop))
         host = running.enter_context(closing(make_live(simulation, robot, robot.id)))
         running.enter_context(viewed(host, view))
         host.reset(np.zeros(1, np.intp), [scene], [getattr(robot, "seed", 0)])

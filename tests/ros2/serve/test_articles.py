@@ -89,6 +89,8 @@ def test_a_trajectory_of_a_real_node_moves_the_arm_and_the_controller_says_so(ar
     assert state.joint_names == names
     np.testing.assert_allclose(state.feedback.positions, goal, atol=0.02)
     np.testing.assert_allclose(state.error.positions, state.reference.positions - state.feedback.positions, atol=1e-9)
+    arm.send(articles.TRAJECTORY_TOPIC, message[0], {"joint_names": names})
+    arm.served.wait_for(f"refused 1: {articles.TRAJECTORY_TOPIC}: the trajectory has no point")
 
 
 def test_twists_of_a_real_node_drive_a_base_by_the_articles_topic(tmp_path: Path) -> None:
@@ -108,6 +110,26 @@ def test_twists_of_a_real_node_drive_a_base_by_the_articles_topic(tmp_path: Path
         ({}, XML.replace(PACKAGE, "bare"), "there are none"),
         ({"Command": MESSAGES["BrainCommand"]}, XML.replace(PACKAGE, "half"), "is the result, which has the fields"),
         ({"Command": "string"}, XML.replace(PACKAGE, "wrong"), "The definition of wrong/msg/Command cannot be read"),
+        *[
+            (
+                MESSAGES | {name: MESSAGES[name].replace(right, wrong)},
+                XML.replace(PACKAGE, package),
+                rf"\b{field} of its message {name}, the .*, is {kind}; it is ",
+            )
+            for package, name, right, wrong, field, kind in (
+                ("numbered", "BrainCommand", "string task_id", "uint64 task_id", "task_id", "uint64"),
+                (
+                    "placed",
+                    "BrainCommand",
+                    "geometry_msgs/PoseStamped",
+                    "geometry_msgs/Point",
+                    "target_pose",
+                    ".*Point",
+                ),
+                ("coded", "TaskResult", "string message", "int32 message", "message", "int32"),
+                ("fixed", "CerebellumState", "[] joint_pos", "[6] joint_pos", "joint_positions", r"float64\[6\]"),
+            )
+        ],
     ],
 )
 def test_a_package_that_is_none_is_named(messages: dict[str, str], xml: str, error: str, tmp_path: Path) -> None:

@@ -1,10 +1,12 @@
 """A bridge between brains and robots on real `rclpy`: one result a goal, limits, a stop whatever ends, and causes."""
 
+import itertools
 import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from bhd_lerobot.cli import ros2, serve
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.serve.bridge import BridgeConfig
+from bhd_lerobot.ros2.serve.bridge import BrainNetworkConfig, BridgeConfig
 from tests.ros2.peer_env import Peer
 from tests.ros2.programs import Program, Side, log_of
 from tests.ros2.serve.bridges import FORWARD, NEAR, STAND, TWIST, arm, base, drives, twist
@@ -69,7 +71,7 @@ def test_setpoints_of_a_brain_move_an_arm(domain: int, tmp_path: Path) -> None:
         goal = {"task_id": "far", "target_pose": pose, "max_velocity": 0.1}
         side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal)
         until(lambda: np.abs(side.joints - target[:6]).max() > 0.05, "it is on its way to the goal")
-        assert bridge.stop() == 0
+        assert bridge.stop(signal.SIGHUP) == 0  # as of a session that is closed
         [result] = side.ended(1)
         assert (result.task_id, result.success) == ("far", False)
         assert result.message == "The robot is no longer served."
@@ -92,6 +94,20 @@ def test_a_base_is_driven_within_limits_and_stands_when_twists_cease_or_it_is_st
     given = np.array([line["given"] for line in log_of(log, "command")])
     assert np.isfinite(given).all()
     assert given[:, 0].max() <= 0.15 + 1e-9
+
+
+def test_a_goal_in_odom_is_driven_to_by_the_robots_own_odometry(domain: int, tmp_path: Path) -> None:
+    goal = {"header": {"frame_id": "odom"}, "target_pose": {"position": {"x": 0.4}, "orientation": {"w": 1.0}}}
+    with base(domain, tmp_path) as (side, _, log):
+
+        def result(name: str) -> str:
+            side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal | {"task_id": name})
+            [ended] = side.ended(1)
+            return "" if ended.success else ended.message
+
+        names = (str(number) for number in itertools.count())
+        until(lambda: (why := result(next(names))) == "" or "/odom" not in why, "the robot's odometry is received")
+        np.testing.assert_allclose(log_of(log, "pose")[-1]["odometry"][:2], [0.4, 0.0], atol=0.15)
 
 
 def test_what_commands_a_robot_twice_is_named(domain: int, tmp_path: Path) -> None:
@@ -191,10 +207,14 @@ def test_a_driver_that_ends_is_a_fault_that_names_its_topic_and_is_over_when_it_
 
 
 def test_brains_are_looked_for_where_the_robot_is_but_for_what_is_given() -> None:
-    robot = UR5Config(plant="ros2", ros2=Ros2Config(domain=7, interface="eth0", peers=["10.0.0.2"]))
-    config = BridgeConfig(robot, network=NetworkConfig(domain=9))
-    assert config.network == NetworkConfig(9, "eth0", ["10.0.0.2"])
-    assert BridgeConfig(robot).network == NetworkConfig(7, "eth0", ["10.0.0.2"])
+    robot = UR5Config(plant="ros2", ros2=Ros2Config(domain=7, interface="eth0", peers=["10.0.0.2"], distro="humble"))
+    for given, network in (
+        ({}, NetworkConfig(7, "eth0", ["10.0.0.2"], "humble")),
+        ({"domain": 9}, NetworkConfig(9, "eth0", ["10.0.0.2"], "humble")),
+        ({"interface": "lo", "peers": [], "distro": "jazzy"}, NetworkConfig(7)),
+    ):
+        found: Any = BridgeConfig(robot, network=BrainNetworkConfig(**given)).network  # type: ignore[arg-type]
+        assert found == network
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
 """What becomes of commands to a served robot: none is lost, a refused one changes nothing, what is cut is said."""
 
 import json
+import re
 import time
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.ros2.live.network import LATCHED, Qos
+from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, Qos
 from bhd_lerobot.ros2.messages import ur
+from bhd_lerobot.ros2.messages.images import COMPRESSED, decode_image
 from bhd_lerobot.ros2.messages.serialize import encode
+from bhd_lerobot.ros2.messages.views import CAMERA_INFO
 from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC, ESTOP_TOPIC
 from tests.ros2.peer_env import Peer
 from tests.ros2.programs import BOOL, Served, Side, served
@@ -216,3 +220,36 @@ def test_a_second_robot_in_the_domain_is_named(base: Side, tmp_path: Path) -> No
     with Served("turtlebot3", "--robot.arena=empty", domain=domain, log=tmp_path / "log") as second:
         for robot in (second, base.served):
             robot.wait_for("Another node, /turtlebot3, subscribes to /brain/command, /cmd_vel, /emergency_stop")
+
+
+def test_every_camera_of_an_arm_has_images_and_its_geometry(tmp_path: Path) -> None:
+    size = ("--robot.camera=true", "--robot.camera_width=64", "--robot.camera_height=48")
+    for arm in served("ur5", tmp_path, *size):
+        for name in ("scene", "wrist"):
+            infos = arm.node.subscription(f"/{name}/camera_info", CAMERA_INFO, SENSOR_DATA)
+            images = arm.node.subscription(f"/{name}/image_raw/compressed", COMPRESSED, SENSOR_DATA)
+            info = arm.newest(infos)
+            assert (info.width, info.height, info.header.frame_id) == (64, 48, f"{name}_optical_frame")
+            assert 20 < info.k[0] < 100
+            assert decode_image(name, COMPRESSED, until(images.take, "an image comes")[-1].data).shape == (48, 64, 3)
+
+
+def test_an_arm_without_a_gripper_goes_on_whatever_comes_for_one(tmp_path: Path) -> None:
+    text = resources.files("bhd_lerobot.bodies").joinpath("so101.xml").read_text(encoding="utf-8")
+    text = re.sub(r'<body name="jaw".*?</body>', "", text, flags=re.DOTALL)
+    path = tmp_path / "bare.xml"
+    path.write_text(text.replace('<position name="gripper" joint="gripper"/>', ""), encoding="utf-8")
+    for arm in served("arm", tmp_path, f"--robot.mjcf={path}"):
+        publisher = arm.node.publisher(ur.GRIPPER_TOPIC, ur.FLOATS)
+        home = np.asarray(arm.state().joint_positions)
+        assert len(home) == 5
+        [opening] = encode(ur.FLOATS, {"data": np.array([[0.02]])}, 1)
+        target = home + 0.1
+        arm.send(ur.POSITION_TOPIC, ur.FLOATS, {"data": target[None]})
+        arm.wait(
+            lambda state, target=target, publisher=publisher, opening=opening: [
+                publisher.send(opening),
+                np.abs(state.joint_positions - target).max() < 0.01,
+            ][1],
+            "it arrives",
+        )
