@@ -13,6 +13,7 @@ from bhd_lerobot.ros2.messages.definitions import find_type, register_message
 _ALL, _BEST_EFFORT, _LATCHED = (2, "keep_all"), (2, "best_effort"), (1, "transient_local")  # as bags have it
 _LEAST_DEPTH, _MOST_DEPTH, _MOST_LATCHED = 200, 10_000, 100
 _COMMANDS = re.compile(r"cmd|command|setpoint|goal|trajectory$|emergency|(^|/)e?stop", re.IGNORECASE)
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _COMMAND_TYPES = (
     "geometry_msgs/msg/Twist",
     "geometry_msgs/msg/TwistStamped",
@@ -59,6 +60,8 @@ def offers_of(bag: Bag, wanted: Collection[str], distro: str) -> tuple[list[Offe
             left_out[name] = f"it has messages of several types: {', '.join((topic.msgtype, *topic.others))}."
         elif topic.serialisation != "cdr":
             left_out[name] = f"its messages are serialised as {topic.serialisation!r}, not as ROS 2 does (cdr)."
+        elif not _NAME.fullmatch(name):
+            left_out[name] = "no topic of ROS 2 has such a name."
         else:
             try:
                 _define(topic.msgtype, bag.definitions, distro)

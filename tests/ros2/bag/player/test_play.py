@@ -219,15 +219,16 @@ def test_commands_and_other_publishers_are_named_before(domain: int, tmp_path: P
 
 
 def test_types_are_those_that_the_bag_defines_also_of_services(domain: int, tmp_path: Path) -> None:
-    names, file = ("event_msgs/srv/Do_Event", "event_msgs/msg/Odd"), tmp_path / "printed"
-    texts = f"event_msgs/Part part\n{'=' * 80}\nMSG: event_msgs/Part\nint32 number\n", "what is this?\n"
+    names, file = ("event_msgs/srv/Do_Event", "event_msgs/msg/Odd", "event_msgs/msg/No ü//Name"), tmp_path / "printed"
+    texts = f"event_msgs/Part part\n{'=' * 80}\nMSG: event_msgs/Part\nint32 number\n", "what is this?\n", "int32 x\n"
     with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         for name, text in zip(names, texts, strict=True):
-            topic = "/" + name.rpartition("/")[2]
+            topic = "/" + name.split("/", 2)[2]
             connection = writer.add_connection(topic, name, msgdef=text, rihs01="RIHS01_0")
             writer.write(connection, START, b"\0\1\0\0\5\0\0\0")
     assert Fork(main, ["play", str(tmp_path / "bag"), f"--domain={domain}", "--wait=0.1"], output=file).wait() == 0
     assert "/Odd is left out: The definition of event_msgs/msg/Odd cannot be read" in file.read_text()
+    assert "/No ü//Name is left out: no topic of ROS 2 has such a name." in file.read_text()
     assert "1 message published" in file.read_text()
 
 
