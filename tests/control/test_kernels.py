@@ -213,17 +213,15 @@ def test_no_machine_code_outlives_a_change_of_what_a_kernel_calls_or_names(monke
 def test_what_kernels_name_is_part_of_their_code() -> None:
     """Numbers are; modules are the interpreter's and numba's, whose versions are; C functions are called by name."""
     libraries = {"math", "np", "fence", "_copy", "_get_state", "_set_state", "_step"}
-    kinds = (int, float, tuple, kernels.Kernel)
-    for one in {value for module in list(sys.modules.values()) for value in vars(module).values() if is_kernel(value)}:
+    kinds = (int, float, tuple, Kernel)
+    importlib.import_module("bhd_lerobot.sim.frames")  # which imports all others
+    modules = [module for name, module in sys.modules.items() if name.startswith("bhd_lerobot.")]
+    for one in {value for module in modules for value in vars(module).values() if isinstance(value, Kernel)}:
         code, scope = one.function.__code__, one.function.__globals__
         assert one.function.__closure__ is None
         assert not any(isinstance(constant, CodeType) for constant in code.co_consts)
         named = {name: scope[name] for name in code.co_names if name in scope and name not in libraries}
         assert not {name: value for name, value in named.items() if not isinstance(value, kinds)}, one
-
-
-def is_kernel(value: Any) -> bool:
-    return isinstance(value, kernels.Kernel) and value.__module__.startswith("bhd_lerobot.")
 
 
 @pytest.mark.parametrize("make", [base_rig, twist_rig, arm])

@@ -23,7 +23,7 @@ from bhd_lerobot.ros2.messages.mapping import (
     features_of,
     topics_of,
 )
-from bhd_lerobot.ros2.messages.parts import image_topic
+from bhd_lerobot.ros2.messages.parts import camera_name, image_topic
 from bhd_lerobot.ros2.messages.scan import static_topics
 from bhd_lerobot.ros2.messages.serialize import decode
 from bhd_lerobot.ros2.messages.table import SCAN
@@ -88,9 +88,13 @@ def exported(bag: Bag) -> Exported | None:
             numbers |= {one.topic for one in (*mapping.observation.values(), *mapping.action.values())}
             images = {one.topic for one in mapping.images.values()}
         found = bag.read({*kinds, *numbers, *(one.topic for one in applied)}, images)
-        heads, states, outcomes = [[decode(kinds[topic], data) for data in found[topic].data] for topic in kinds]
+        heads, *frames = [[decode(kinds[topic], data) for data in found[topic].data] for topic in kinds]
         received = found[types.EPISODE_TOPIC].received.tolist()
-        episodes = [_episode(*one, states, outcomes) for one in zip(heads, received, strict=True)]
+        states, outcomes = map(_by_episode, frames)
+        episodes = [
+            _episode(head, time, states.get(head.episode_index, []), outcomes.get(head.episode_index, []))
+            for head, time in zip(heads, received, strict=True)
+        ]
         for episode, values in zip(episodes, _applied(found, applied, heads), strict=False):
             episode.columns[keys.APPLIED_ACTION] = values
         messages = {name: found[name] for name in numbers | images}
@@ -99,11 +103,18 @@ def exported(bag: Bag) -> Exported | None:
         return None  # damaged; import names what it lacks
 
 
+def _by_episode(messages: Sequence[Any]) -> dict[int, list[Any]]:
+    found: dict[int, list[Any]] = {}
+    for one in messages:
+        found.setdefault(one.episode_index, []).append(one)
+    return found
+
+
 def _episode(head: Any, received: int, states: Sequence[Any], outcomes: Sequence[Any]) -> StatedEpisode:
     metadata, features = json.loads(head.metadata), json.loads(head.features)
-    # Of a dataset with outcomes each episode has one.
-    outcome = Event[(metadata["outcome"] or "nothing").upper()].cause if "outcome" in metadata else None
-    states, outcomes = ([one for one in all_ if one.episode_index == head.episode_index] for all_ in (states, outcomes))
+    # Of a dataset with outcomes each episode has one; those of other programs may have other names.
+    named = metadata["outcome"] or "nothing" if "outcome" in metadata else ""
+    outcome = Event[named.upper()].cause if named.upper() in Event.__members__ else None
     columns = {
         key: np.array([getattr(one, key.rpartition(".")[2]) for one in messages]).astype(keys.SCALARS[key][0])
         for names, messages in ((types.STATE_COLUMNS, states), (types.OUTCOME_COLUMNS, outcomes))
@@ -140,8 +151,10 @@ def _mapping(topics: Mapping[str, Topic], head: Any) -> MappingConfig | None:
     for key, feature in json.loads(head.features).items():
         for topic in (image_topic(key, compressed=compressed) for compressed in (False, True)):
             name = key.removeprefix(f"{keys.OBSERVATION_IMAGES}.")
-            if feature["dtype"] == "video" and topic in topics and name.isidentifier():
-                images[name] = ImageConfig(topic, type=topics[topic].msgtype)
+            if feature["dtype"] == "video" and topic in topics:
+                images[name if name.isidentifier() else camera_name(key)] = ImageConfig(
+                    topic, type=topics[topic].msgtype
+                )
     return MappingConfig(observation, action, images) if observation and action else None
 
 

@@ -31,7 +31,8 @@ OUTCOMES = ("success", "nothing", "timeout")
 def by_hand(root: Path, robot: str, observed: tuple[str, ...], actions: tuple[str, ...], **options: Any) -> Path:
     """A recording of the wall clock: frames at 30 Hz that jitter, some left out; readings of 5 Hz that are old."""
     rng, fps, is_judged = np.random.default_rng(5), options.pop("fps", 30), options.pop("is_judged", True)
-    features = keys.dataset_features(observed, actions, {"front": (32, 48, 3)} if robot == "ros2" else {}, {})
+    camera, word = options.pop("camera", "front"), options.pop("word", "")
+    features = keys.dataset_features(observed, actions, {camera: (32, 48, 3)} if robot == "ros2" else {}, {})
     with DatasetRecorder.create("t/t", fps, features, robot_type=robot, root=root) as recorder:
         for number, outcome in enumerate(OUTCOMES):
             n = 1 if number == 1 else 40
@@ -50,8 +51,8 @@ def by_hand(root: Path, robot: str, observed: tuple[str, ...], actions: tuple[st
             columns |= {keys.TIME: time, keys.DONE: np.arange(n) == n - 1, keys.EVENT: (np.arange(n) == n - 1) * event}
             writer.set_columns(columns)
             for frame in range(n if robot == "ros2" else 0):
-                writer.add_image("observation.images.front", np.full((32, 48, 3), 40 + 4 * frame, np.uint8))
-            ended = {"outcome": outcome, "success": outcome == "success"} if is_judged else {}
+                writer.add_image(f"observation.images.{camera}", np.full((32, 48, 3), 40 + 4 * frame, np.uint8))
+            ended = {"outcome": word or outcome, "success": outcome == "success"} if is_judged else {}
             recorder.save(writer, task=f"Bring cup {number}.", metadata=ended)
     return root
 
@@ -130,6 +131,16 @@ def test_a_dataset_of_another_program_comes_back_but_for_frames_without_numbers(
         ours, theirs = read_episode(root, episode), read_episode(back, episode)
         for key in (keys.OBSERVATION_STATE, keys.ACTION):
             assert np.array_equal(ours[key][first:], theirs[key]), key
+
+
+def test_words_of_other_programs_for_cameras_and_outcomes_cost_nothing_else(tmp_path):
+    names = ("x.vel", "lift.pos")
+    root = by_hand(tmp_path / "d", "ros2", names, names, camera="cam-left", word="well done")
+    assert run(tmp_path / "back", export(root, tmp_path / "bags", "--one_bag")) == 0
+    found = dataset_info(tmp_path / "back")
+    assert "observation.images.cam_left" in found.features  # as its topic is called
+    assert [one.frames for one in found.episodes] == [one.frames for one in dataset_info(root).episodes]
+    assert not any("outcome" in one.metadata for one in found.episodes)
 
 
 NUMBERS = "topic: /bhd/observation_state, type: bhd_msgs/msg/Numbers, field: 'values[names=theta.vel]', scale: 10"
