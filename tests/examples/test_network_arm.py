@@ -28,7 +28,7 @@ from tests.waiting import until
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "network_arm"
 PATIENT = ["--robot.realtime.plant_timeout_s=1.0", "--robot.realtime.most_misses=1000000"]
 # What a recorder says that a loaded machine kept from running for longer than `PATIENT`: it is started again.
-STALLED = r"newest reading is \d+\.\d\d s old|has published nothing for"
+STALLED = r"newest reading is \d+\.\d\d s old|has published nothing for|rad from its reference"
 ALONE = r"""
 import json, sys
 from lerobot_robot_network_arm import NetworkArmConfig, NetworkArm
@@ -155,13 +155,13 @@ def test_its_death_ends_the_episode_with_the_reason(arms, installed, tmp_path):
         arm, root, name = arms(), tmp_path / f"data_{number}", f"dies_{number}"
         output = tmp_path / f"output_{number}"
         process = start(record.main, installed, [*recording(arm, root, *longer), f"--robot.id={name}"], output)
-        if _runs(process, name):
+        if is_killed := _runs(process, name):
+            arm.signal(signal.SIGKILL)
+        status, said = process.wait(), " ".join(output.read_text().split())
+        if is_killed and "rad from its reference" not in said:  # a slow arm, which was stopped before it was killed
             break
-        process.wait()
-        assert re.search(STALLED, " ".join(output.read_text().split())), output.read_text()
-    arm.signal(signal.SIGKILL)
-    assert process.wait() == 4, output.read_text()
-    said = " ".join(output.read_text().split())
+        assert re.search(STALLED, said), said
+    assert status == 4, said
     assert re.search(r"stopped by a fault: its newest reading is \d+\.\d\d s old", said), said
     assert check_dataset(root).is_valid
     info = dataset_info(root)

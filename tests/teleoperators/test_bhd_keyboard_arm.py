@@ -217,7 +217,7 @@ def test_as_a_brain_it_starts_where_the_robot_is_at_an_episode_and_at_a_takeover
     teleop._clock = clock
     names = (*JOINT_ACTIONS, *TOOL_NAMES[:-1])
     body = UR5Config().body()
-    brain.bind(RobotFeatures(names, TOOL_NAMES, 25, body=body, robot_type="ur5"))
+    brain.bind(RobotFeatures(names, TOOL_NAMES, 1, body=body, robot_type="ur5"))  # which has a frame to answer in
     tool = pose_vectors(ArmKinematics(body.arm.chain, body.limits).tool(np.array(body.arm.home[:6])))
     observation = Observation(names, np.array([[*body.arm.home, *tool]]))
     for _ in range(2):

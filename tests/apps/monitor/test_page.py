@@ -245,8 +245,9 @@ def see_it_move(browser: Any, robot: Robot, watched: Any) -> None:
         assert kinds in (["scan", "top", "scene"], ["arm-above", "arm-side", "scene"])
         wait_until(page, "document.querySelector('[data-view=scene] canvas').dataset.frame === '0'")
         assert "tracking" in page.text_content("#state")
-        robot.publish()  # of now: one that is old has a line of its own, and takes its place
-        wait_until(page, "document.getElementById('banner').hidden")
+        while not page.evaluate("document.getElementById('banner').hidden"):  # one that is old has a line of its own
+            robot.publish()
+            page.wait_for_timeout(20)
         before = pixels(page)
         robot.move()
         while pixels(page) == before:

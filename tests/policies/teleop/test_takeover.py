@@ -97,8 +97,8 @@ def test_what_a_person_does_is_what_the_expert_would_do(tmp_path: Path) -> None:
     both: Any = TakeoverBrain(brain, person, lambda: 2 <= next(frames) < 5)  # type: ignore[arg-type]
     robot = MockArm(MockArmConfig(id="arm", calibration_dir=tmp_path))
     robot.connect()
-    with closing(LeRobotHost(robot, 50, GateConfig())) as host:
-        loop = EpisodeLoop(host, make_task(FreeConfig(duration_s=0.16), 1, 50, None), both)
+    with closing(LeRobotHost(robot, 10, GateConfig())) as host:
+        loop = EpisodeLoop(host, make_task(FreeConfig(duration_s=0.8), 1, 10, None), both)
         (episode,) = loop.run([EpisodeSpec(0, 0)])
     action, expert = episode.columns[keys.ACTION], episode.columns[keys.EXPERT_ACTION]
     # An expert that took over from the brain by itself has intervened, too.
