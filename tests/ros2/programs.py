@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.cli import record, serve
 from bhd_lerobot.control.messages import NANOSECONDS
+from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.realtime.block import Word
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.ros2.live.network import EVERY, NetworkConfig
@@ -118,6 +119,19 @@ class Bridged(Program):
         super().__exit__(kind, error, _)
 
 
+def put(publisher: Publisher, data: bytes) -> None:
+    """Send a message once there is room for it: a receiver on a busy machine may have none for now."""
+
+    def is_sent() -> bool:
+        try:
+            publisher.send(data)
+        except RealtimeError:
+            return False
+        return True
+
+    until(is_sent, f"{publisher.topic} takes a message")
+
+
 class Side:
     """Another node, and the robot that it commands."""
 
@@ -136,7 +150,7 @@ class Side:
         return publisher
 
     def send(self, topic: str, msgtype: str, fields: dict[str, Any]) -> None:
-        self.publisher(topic, msgtype).send(encode(msgtype, fields, 1)[0])
+        put(self.publisher(topic, msgtype), encode(msgtype, fields, 1)[0])
 
     def newest(self, subscription: Subscription | None = None) -> Any:
         return until((subscription or self.states).take, "a message comes")[-1].message()

@@ -19,7 +19,7 @@ from bhd_lerobot.ros2.messages.serialize import encode
 from bhd_lerobot.ros2.messages.views import CAMERA_INFO
 from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC, ESTOP_TOPIC
 from tests.ros2.peer_env import Peer
-from tests.ros2.programs import BOOL, Served, Side, served
+from tests.ros2.programs import BOOL, Served, Side, put, served
 from tests.waiting import until
 
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -51,7 +51,7 @@ def test_a_press_among_any_number_of_messages_presses(values: list[bool], base: 
     publisher = base.publisher(ESTOP_TOPIC, BOOL)
     data = {value: encode(BOOL, {"data": value}, 1)[0] for value in (False, True)}
     for value in values:
-        publisher.send(data[value])
+        put(publisher, data[value])
     base.wait(lambda state: state.emergency_stop, "the stop is latched")
     base.reset()
 
@@ -60,7 +60,7 @@ def test_a_best_effort_publisher_presses_and_is_no_mismatch(base: Side) -> None:
     before, publisher = len(base.served.text), base.node.publisher(ESTOP_TOPIC, BOOL, Qos(1, reliable=False))
     [data] = encode(BOOL, {"data": True}, 1)
     # What is sent before both sides have found each other is lost: a button publishes as long as it is pressed.
-    base.wait(lambda state: state.emergency_stop or publisher.send(data), "the stop is latched")
+    base.wait(lambda state: state.emergency_stop or put(publisher, data), "the stop is latched")
     base.reset()
     assert "best effort" not in base.served.text[before:]
 
@@ -74,7 +74,7 @@ def test_each_goal_of_a_flood_has_one_result_and_the_stop_is_not_behind_it(base:
     publisher, far = base.publisher(COMMAND_TOPIC, COMMAND), goal("", 0.0)
     messages = [encode(COMMAND, far | {"task_id": f"flood {k}"}, 1)[0] for k in range(3000)]
     for message in messages:
-        publisher.send(message)
+        put(publisher, message)
     before = len(base.results.take())
     base.press()
     assert before < 3000  # it is pressed while goals still wait
