@@ -76,8 +76,10 @@ def test_it_follows_setpoints_and_goals_and_stops(bus: Bus) -> None:
         action = {name: seen[name] for name in robot.action_features} | {"shoulder_pan.pos": 0.4, "gripper.pos": 0.05}
 
         def arrives() -> bool:
-            robot.send_action(action)
-            return abs(robot.get_observation()["shoulder_pan.pos"] - 0.4) < 0.01
+            where = robot.get_observation()["shoulder_pan.pos"]
+            # Not far ahead: on a busy machine the arm is late, and is not to seem blocked.
+            robot.send_action(action | {"shoulder_pan.pos": where + np.clip(0.4 - where, -0.05, 0.05)})
+            return bool(abs(where - 0.4) < 0.01)
 
         until(arrives, "the first joint is where it was sent")
         goals = (np.array([list(goal.values()) for goal in bus.goals])[:, :5] - 2048) / STEPS
@@ -87,7 +89,7 @@ def test_it_follows_setpoints_and_goals_and_stops(bus: Bus) -> None:
         assert (goals > np.array(limits.lower[:5]) - 0.12).all()
         assert (goals < np.array(limits.upper[:5]) + 0.12).all()
         until(lambda: mode(robot) == Mode.HOLD, "it holds")
-        goal = BrainCommand("home", joint_target=robot.body.arm.home[:5], gripper=0.02)
+        goal = BrainCommand("home", joint_target=robot.body.arm.home[:5], gripper=0.02, max_velocity=0.2)
         assert robot.host.bridge.submit(goal) is None
         [result] = until(robot.take_results, "the goal ends")
         assert result.success, result
