@@ -8,9 +8,8 @@ from importlib import import_module
 from typing import Any
 
 from bhd_lerobot.ros2.messages.definitions import find_type
-from bhd_lerobot.ros2.messages.types import type_store
+from bhd_lerobot.ros2.messages.types import ARRAY, BASE, BYTES, NAME, type_store
 
-_BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4  # rosbags' Nodetype
 _KINDS = {"bool": bool, "string": str}
 
 
@@ -60,14 +59,14 @@ def _fields(msgtype: str) -> dict[str, Any]:
 def _kind(description: Any) -> Any:
     idl: Any = import_module("cyclonedds.idl.types")
     kind, inner = int(description[0]), description[1]
-    if kind == _NAME:
+    if kind == NAME:
         return _nested(inner)
-    if kind == _BASE:
+    if kind == BASE:
         name, bound = inner
         if name == "string" and bound:
             return idl.bounded_str[bound]
-        return _KINDS.get(name) or getattr(idl, {"octet": "uint8", "char": "uint8"}.get(name, name))
+        return _KINDS.get(name) or getattr(idl, BYTES.get(name, name))
     element, count = inner
-    if kind == _ARRAY:
+    if kind == ARRAY:
         return idl.array[_kind(element), count]
     return idl.sequence[(_kind(element), count)] if count else idl.sequence[_kind(element)]

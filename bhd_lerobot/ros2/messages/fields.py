@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.ros2.messages.types import type_store, unknown_type
+from bhd_lerobot.ros2.messages.types import ARRAY, BASE, BYTES, NAME, type_store, unknown_type
 
-_BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags' Nodetype; what remains is a sequence
-_WHOLE = {"char": "uint8", "octet": "uint8"}  # other types of whole numbers have numpy's names
 _STEP = re.compile(r"(?P<name>[A-Za-z]\w*)(?:\[(?:(?P<index>\d+)|(?P<key>[A-Za-z]\w*)=(?P<value>.+))\])?")
 
 
@@ -118,7 +116,7 @@ class Field:
         tree[last.name] = grown
 
     def _typed(self, values: NDArray[np.float64]) -> NDArray[Any]:
-        kind = _WHOLE.get(self._resolved[2], self._resolved[2])
+        kind = BYTES.get(self._resolved[2], self._resolved[2])
         if kind.startswith("float"):
             return values
         low, high = (0, 1) if kind == "bool" else (int(np.iinfo(kind).min), int(np.iinfo(kind).max))
@@ -139,18 +137,18 @@ class Field:
             if match["name"] not in fields:
                 raise ConfigError(f"{self.path}: {unknown_name(f'field of {inside}', match['name'], fields)}")
             node = fields[match["name"]]
-            is_list = int(node[0]) not in (_BASE, _NAME)
+            is_list = int(node[0]) not in (BASE, NAME)
             selects = match["index"] is not None or match["key"] is not None
             if selects and not is_list:
                 raise ConfigError(f"{self.path}: {match['name']} of {inside} is not an array; leave [...] out.")
             element = node[1][0] if is_list else node
-            is_message = int(element[0]) == _NAME
+            is_message = int(element[0]) == NAME
             if match["key"] is not None:
                 beside = dict(store.fielddefs[element[1]][1]) if is_message else fields
                 if match["key"] not in beside:
                     owner = element[1] if is_message else inside
                     raise ConfigError(f"{self.path}: {unknown_name(f'field of {owner}', match['key'], beside)}")
-            length = node[1][1] if int(node[0]) == _ARRAY else 0
+            length = node[1][1] if int(node[0]) == ARRAY else 0
             index = None if match["index"] is None else int(match["index"])
             steps.append(_Step(match["name"], index, match["key"] or "", match["value"] or "", is_message, length))
             if place < len(parts) - 1:

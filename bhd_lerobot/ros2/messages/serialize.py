@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 
 from bhd_lerobot.errors import ConfigError, DatasetError, unknown_name
-from bhd_lerobot.ros2.messages.types import type_store
+from bhd_lerobot.ros2.messages.types import ARRAY, BASE, BYTES, NAME, type_store
 
 Tree = Mapping[str, Any]
 """Values by field name: a constant, an array of shape (n,) or (n, m), a `Tree` for a nested message, a list of them."""
-
-_BASE, _NAME, _ARRAY = 1, 2, 3  # of rosbags' Nodetype; what remains is a sequence
 
 
 def encode(msgtype: str, fields: Tree, n: int) -> list[bytes]:
@@ -54,16 +52,16 @@ def _check_message(msgtype: str, fields: Any, where: str) -> None:
 
 def _check(description: Any, value: Any, where: str) -> None:
     kind, inner = int(description[0]), description[1]
-    if kind == _NAME:
+    if kind == NAME:
         _check_message(inner, value, where)
-    elif kind == _BASE:
+    elif kind == BASE:
         _check_base(inner[0], value, where)
     else:
         element, count = inner
         if not isinstance(value, list | tuple) and not (isinstance(value, np.ndarray) and value.ndim == 1):
             raise ConfigError(f"{where} is {value!r}; it is a list.")
-        if count and (len(value) != count if kind == _ARRAY else len(value) > count):
-            raise ConfigError(f"{where} has {len(value)} elements, not {'' if kind == _ARRAY else 'at most '}{count}.")
+        if count and (len(value) != count if kind == ARRAY else len(value) > count):
+            raise ConfigError(f"{where} has {len(value)} elements, not {'' if kind == ARRAY else 'at most '}{count}.")
         for place, one in enumerate(value):
             _check(element, one, f"{where}, element {place},")
 
@@ -77,7 +75,7 @@ def _check_base(name: str, value: Any, where: str) -> None:
     elif name.startswith("float"):
         fits, wanted = isinstance(value, int | float | np.number) and not is_truth, "a number"
     else:
-        limits = np.iinfo("uint8" if name in ("octet", "char", "byte") else name)
+        limits = np.iinfo(BYTES.get(name, name))
         is_whole = isinstance(value, int | np.integer) and not is_truth
         fits = bool(is_whole and limits.min <= value <= limits.max)
         wanted = f"a whole number from {limits.min} to {limits.max}"
@@ -121,13 +119,13 @@ def _definition(msgtype: str) -> tuple[Any, dict[str, Any]]:
 
 def _value(description: Any, value: Any, row: int) -> Any:
     kind, inner = int(description[0]), description[1]
-    if kind == _NAME:
+    if kind == NAME:
         return _message(inner, value or {}, row)
-    if kind == _BASE:
+    if kind == BASE:
         value = value[row] if isinstance(value, np.ndarray) else value
         return (value or "") if inner[0] == "string" else (value or 0)
     (element, count) = inner
-    if int(element[0]) == _BASE and element[1][0] != "string":
-        values = (np.zeros(count if kind == _ARRAY else 0)) if value is None else np.asarray(value)
+    if int(element[0]) == BASE and element[1][0] != "string":
+        values = (np.zeros(count if kind == ARRAY else 0)) if value is None else np.asarray(value)
         return np.ascontiguousarray(values[row] if values.ndim == 2 else values, np.dtype(element[1][0]))
     return [_value(element, part, row) for part in value or ()]

@@ -12,7 +12,10 @@ from typing import Any
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError, install_extra
 
-_BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags' Nodetype; what remains is a sequence
+BASE, NAME, ARRAY = 1, 2, 3
+"""Kinds of fields, as `rosbags` describes them; what remains is a sequence."""
+BYTES = {"octet": "uint8", "char": "uint8", "byte": "uint8"}
+"""Types of whole numbers that are called otherwise than by numpy."""
 
 FORMAT = 2
 """Version of the messages below."""
@@ -188,7 +191,7 @@ def unknown_type(name: str, known: Iterable[str]) -> str:
 def type_text(description: Any) -> str:
     """Return the type of a field, by `rosbags`' description of it, in ROS's message language, without bounds."""
     kind, inner = int(description[0]), description[1]
-    if kind in (_BASE, _NAME):
-        return str(inner[0] if kind == _BASE else inner)
+    if kind in (BASE, NAME):
+        return str(inner[0] if kind == BASE else inner)
     element, count = inner
-    return f"{type_text(element)}[{count if kind == _ARRAY else ''}]"
+    return f"{type_text(element)}[{count if kind == ARRAY else ''}]"

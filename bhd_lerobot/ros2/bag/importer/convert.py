@@ -236,10 +236,11 @@ class _RobotBag:
         """Yield the episodes that a bag states, or that its sensors allow."""
         options, stated = self._options, () if self._stated is None else self._stated.episodes
         if self._is_as_stated:
+            ordered = [track.part(np.ones(len(track.times), np.bool_)) for track in self._tracks]
             for one in stated:
                 # Of its own messages: those that are left out are not replaced by another episode's in the same bag.
-                first, last = int(one.times[0]) - ROUNDING_NS, int(one.times[-1]) + ROUNDING_NS
-                tracks = [track.part((track.times >= first) & (track.times <= last)) for track in self._tracks]
+                span = one.times[0] - ROUNDING_NS, one.times[-1] + ROUNDING_NS + 1
+                tracks = [track.rows(np.arange(*np.searchsorted(track.times, span))) for track in ordered]
                 readings = [track.times for track in tracks if not track.is_action]
                 if not all(map(len, readings)):
                     self.notes.append(f"an episode of {len(one.times)} frames has no readings, and is left out")
