@@ -32,7 +32,7 @@ _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
 _ANSWER_S = 30.0  # that it may take to place a scene
 _HEAD_START_S = 0.02  # from the order to run to the first tick
-_END_S = 5.0  # that a process has to end in order before it is killed
+_END_S = 10.0  # that a process has to end in order before it is killed; a LeRobot device may take half of it
 _FIFO = 256
 _REST_S = 0.002  # between two checks of the planner for a request
 
