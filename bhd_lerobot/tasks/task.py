@@ -36,7 +36,8 @@ TASKS: Registry[Any] = Registry("task", _OWN, TaskConfig)
 
 Split = Literal["train", "held_out", "validation"]
 SPLITS: tuple[Split, ...] = ("train", "held_out", "validation")
-_VALIDATION = 1  # makes other episodes of a run's seed and numbers
+_VALIDATION, _FAR = 1, 2  # make other episodes of a run's seed and numbers
+_WORD = 2**32  # NumPy takes a larger number for several: k + 2**32 for k, 1
 
 
 class Event(IntEnum):
@@ -94,7 +95,11 @@ def episode_seed(seed: int, episode: int, split: Split) -> int:
         raise ConfigError(f"Unknown split {split!r}. Valid: {', '.join(SPLITS)}.")
     if seed < 0 or episode < 0:
         raise ConfigError(f"Seeds and episode numbers start at 0; got seed {seed}, episode {episode}.")
-    words = [seed, episode] if split != "validation" else [seed, episode, _VALIDATION]
+    words = [seed, episode]
+    if split == "validation":
+        words.append(_VALIDATION)
+    elif split == "held_out" and max(words) >= _WORD:
+        words.append(_FAR)  # so that it is no episode of validation
     word = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
     return (int(word) >> 2) * 2 + int(split != "train")
 

@@ -121,8 +121,11 @@ def test_seeds_fit_the_columns_of_a_dataset_and_do_not_change() -> None:
 
 
 def test_episodes_to_choose_by_are_none_of_those_that_are_learned_from_or_reported() -> None:
-    sets = {split: {episode_seed(seed, i, split) for seed in range(20) for i in range(200)} for split in SPLITS}
-    assert all(len(one) == 4000 for one in sets.values())
+    """Also where an environment has gone on to from the first ones, 2**32 further each time."""
+    far = [(k * 2**32 + seed, j * 2**32 + i) for seed in range(3) for i in range(3) for j in range(3) for k in range(3)]
+    pairs = {*((seed, i) for seed in range(20) for i in range(200)), *far}
+    sets = {split: {episode_seed(*pair, split) for pair in pairs} for split in SPLITS}
+    assert all(len(one) >= 4000 for one in sets.values())
     assert not sets["validation"] & (sets["train"] | sets["held_out"])
     assert all(seed % 2 == 0 for seed in sets["train"])
     assert all(seed % 2 for seed in sets["validation"] | sets["held_out"])
