@@ -9,6 +9,7 @@ import pytest
 
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.datasets.format import features as keys
+from bhd_lerobot.datasets.loader.check import fingerprint
 from bhd_lerobot.datasets.loader.loader import LoaderConfig, make_loader
 from bhd_lerobot.errors import ConfigError, DatasetError
 from bhd_lerobot.policies.baselines import NoopConfig, RandomBrain, RandomConfig
@@ -210,15 +211,19 @@ def test_what_the_expert_would_do_is_recorded_in_every_frame_and_learned_from_in
     # Together they are one dataset, of which both loaders serve the expert's actions, with their statistics.
     merge([driven, alone], both)
     wanted = np.concatenate([advice, rule["action"]])
-    for budget in (4.0, 1e-4):
+    digests = set()
+    for budget in (4.0, 1e-9):
         loading = LoaderConfig(
             batch_size=7, expert_action=True, budget_gib=budget, delta_timestamps={"action": [0.0, 0.1]}
         )
         loaders = make_loader("t/t", loading, root=both, report=lambda _: None)
+        assert (type(loaders.dataset).__name__ == "LeRobotDataset") == (budget < 1)
+        digests.add(fingerprint(loaders.dataset, ["action"]))
         for batch in loaders.train:
             assert np.array_equal(batch["action"][:, 0].numpy(), wanted[batch["index"].numpy()].astype(np.float32))
         stats = loaders.dataset.meta.stats["action"]
         assert np.allclose(stats["mean"], wanted.mean(axis=0), atol=1e-5)
+    assert len(digests) == 1
 
 
 EXPERTS = {

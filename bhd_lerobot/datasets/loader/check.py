@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from bhd_lerobot.datasets.format.features import names_of, numbered_names_of
+from bhd_lerobot.datasets.format.features import ACTION, EXPERT_ACTION, names_of, numbered_names_of
 from bhd_lerobot.datasets.loader.table import FrameTable
 from bhd_lerobot.errors import DatasetError, quoted
 from bhd_lerobot.stock import load_stats
@@ -85,7 +85,10 @@ def _columns(dataset: Any, keys: Collection[str]) -> Iterator[tuple[str, torch.T
     if isinstance(table, FrameTable):
         rows = dataset.rows
     else:
-        table = FrameTable.open(dataset.meta, dataset.episodes, keys)
+        # Where the expert's action is served as `action`, it has no column of its own any more.
+        is_of_expert = EXPERT_ACTION in dataset.meta.features and EXPERT_ACTION not in dataset.hf_dataset.column_names
+        sources = {ACTION: EXPERT_ACTION} if is_of_expert else None
+        table = FrameTable.open(dataset.meta, dataset.episodes, keys, sources)
     for key in keys:
         column = table.columns.get(key)
         if column is not None and column.is_floating_point():

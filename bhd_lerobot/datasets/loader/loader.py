@@ -178,7 +178,7 @@ def _lerobot_dataset(
     _check_positions(dataset, sorted(episodes), reason)
     if config.expert_action:
         frames = dataset.hf_dataset.remove_columns(ACTION)
-        dataset.hf_dataset = frames.rename_column(EXPERT_ACTION, ACTION)
+        dataset.reader.hf_dataset = frames.rename_column(EXPERT_ACTION, ACTION)
     return dataset
 
 
