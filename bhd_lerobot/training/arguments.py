@@ -31,7 +31,7 @@ def parse_train(arguments: Sequence[str] | configuration.CommandLine) -> BhdTrai
         values["output_dir"] = str(checkpoint.parent.parent)  # the run may have been moved
         _refuse_ignored(line.options, values)
     else:
-        values = line.file
+        values = {**line.file, "resume": False}  # only a command line resumes a run
     return config_of(line.over(values), checkpoint)
 
 
@@ -105,7 +105,7 @@ def config_of(values: dict[str, Any], checkpoint: Path | None = None) -> BhdTrai
     _drop_defaults(BhdTrainConfig, values)
     config = configuration.decode(BhdTrainConfig, values)
     if checkpoint is not None:
-        config.checkpoint_path = checkpoint
+        config.checkpoint_path, config.started_from = checkpoint, config.policy.pretrained_path
         config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL_DIR
     return config
 

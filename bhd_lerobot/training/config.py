@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
@@ -102,6 +102,7 @@ class BhdTrainConfig(TrainPipelineConfig):
     fine_tune_parameters: list[str] = field(default_factory=lambda: ["*"])
     fine_tune_camera: bool = False
     threads: Count | None = None
+    started_from = cast("str | Path | None", None)  # not an option: `policy.pretrained_path` of a run that is resumed
 
     def _resolve_pretrained_from_cli(self) -> None:
         """Do nothing: `arguments.parse_train` has done it, and from its own arguments."""
@@ -189,9 +190,17 @@ class BhdTrainConfig(TrainPipelineConfig):
                     f"it to false and both optimizer and scheduler, or change policy.{name}_… instead."
                 )
 
+    def plain(self) -> dict[str, Any]:
+        """Return plain values that make the same run again: of one that is resumed those that it was started with."""
+        values = encode(self)
+        if self.resume:
+            values |= {"resume": False, "checkpoint_path": None}
+            values["policy"]["pretrained_path"] = None if self.started_from is None else str(self.started_from)
+        return values
+
     def _save_pretrained(self, save_directory: Path) -> None:
         """Write LeRobot's fields into the file that LeRobot reads, and ours beside it."""
-        values = encode(self)
+        values = self.plain()
         own = {name: values.pop(name) for name in own_fields()}
         (save_directory / TRAIN_CONFIG_NAME).write_text(json.dumps(values, indent=4), encoding="utf-8")
         (save_directory / OWN_CONFIG_NAME).write_text(json.dumps(own, indent=4), encoding="utf-8")

@@ -12,10 +12,11 @@ import yaml
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from bhd_lerobot.datasets.remote.errors import transfer_errors
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 from bhd_lerobot.hub.push import check_pushable
 from bhd_lerobot.hub.transfer import prompt_interrupt
-from bhd_lerobot.options.parse import encode
+from bhd_lerobot.options.parse import RUN_CONFIG
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
 from bhd_lerobot.stock import push_checkpoint_to_hub
 from bhd_lerobot.training import checkpoint
@@ -132,8 +133,8 @@ class RunOutput:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             checkpoint.clean(folder)
-            text = yaml.safe_dump(encode(config), sort_keys=False, default_flow_style=None, width=110)
-            (folder / "config.yaml").write_text(text, encoding="utf-8")
+            text = yaml.safe_dump(config.plain(), sort_keys=False, default_flow_style=None, width=110)
+            Disk().publish(folder / RUN_CONFIG, text.encode())
             config._save_pretrained(folder)
             return MetricsFile(folder / METRICS_NAME, read_metrics(source / METRICS_NAME, step))
         except OSError as error:

@@ -48,6 +48,13 @@ def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> Non
     config = tmp_path / "one" / "config.yaml"
     run_train([f"--config_path={config}", f"--output_dir={tmp_path / 'two'}"])
     assert curve(tmp_path / "one") == curve(tmp_path / "two")
+    # Also of a run that was resumed, which it does not touch.
+    again = ["--resume=true", f"--config_path={tmp_path / 'two' / 'checkpoints' / '000010'}"]
+    assert run_train(again)[0].step == 20
+    with pytest.raises(ConfigError, match=r"two exists\. .*continue its run with --resume=true"):
+        run_train([f"--config_path={tmp_path / 'two'}"])
+    run_train([f"--config_path={tmp_path / 'two'}", f"--output_dir={tmp_path / 'three'}"])
+    assert curve(tmp_path / "one") == curve(tmp_path / "two") == curve(tmp_path / "three")
 
 
 @pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
