@@ -90,7 +90,7 @@ def write_report(given: ReportInput, path: Path) -> None:
         listed=LISTED,
         replay=partial(replay_command, given.config, folder),
         latency_rows=_latency(given.timing),
-        command=shlex.join(["bhd-eval", f"--config_path={folder / 'config.yaml'}"]),
+        command=shlex.join(["bhd-eval", f"--config_path={folder / 'config.yaml'}", f"--output_dir={folder}_again"]),
         numbers="" if environment else _range(facts["episodes"]),
         digest=hashlib.sha256((folder / "results.json").read_bytes()).hexdigest(),
         yaml=yaml.safe_dump(encode(given.config), sort_keys=False, allow_unicode=True),
@@ -161,11 +161,9 @@ def _summary(results: EvalResults) -> Table:
     return ["success", *(heading for heading, _, _ in columns)], rows
 
 
-def _unseen(results: EvalResults) -> dict[str, Any] | None:
+def _unseen(results: EvalResults) -> dict[str, Any]:
     """Return, of a brain, by how much episodes that were left unseen could change its score: why intervals are wide."""
     label, one = max(results.brains.items(), key=lambda item: item[1].episodes)
-    if one.episodes < 2:
-        return None
     share, score = unseen_share(one.episodes), one.means["score"].value
     ends = {"low": (1 - share) * score, "high": score + share * (1 - score)}
     return {"label": label, "episodes": one.episodes, "share": share, **ends}

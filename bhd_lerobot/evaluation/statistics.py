@@ -59,13 +59,13 @@ def mean(
     The correction is that of P. Hall, "On the removal of skewness by transformation", Journal of the Royal Statistical
     Society B 54 (1992). Where the values have bounds, the interval also holds what would be the mean if a share of the
     episodes that easily stays unseen, 3 / n of them for 95 %, had the value of a bound: twenty equal scores do not
-    prove that there are no others. Where they have none, equal values have no interval: NaN.
+    prove that there are no others. Where they have none, equal values, or a single one, have no interval: NaN.
     """
     sample = np.asarray(values, np.float64)
     count = len(sample)
-    if count < 2:
-        return Estimate(float(sample[0]) if count else math.nan, math.nan, math.nan)
-    value, spread = float(sample.mean()), float(sample.std(ddof=1))
+    if not count:
+        return Estimate(math.nan, math.nan, math.nan)
+    value, spread = float(sample.mean()), float(sample.std(ddof=1)) if count > 1 else 0.0
     low = high = math.nan
     if spread > _FLAT * np.abs(sample).max():
         quantile = float(student.ppf((1 + confidence) / 2, count - 1))

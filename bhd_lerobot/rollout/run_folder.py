@@ -26,7 +26,7 @@ def run_folder(config: Any, kind: str, name: str = "") -> Iterator[Path]:
         name = name or f"{config.robot.type}_{config.task.get_choice_name(type(config.task))}"
         folder = Path("outputs") / kind / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{name}"
     try:
-        folder, missing = _made(folder, is_new=not config.output_dir)
+        folder, missing = made(folder, is_new=not config.output_dir)
         before = (folder / RUN_CONFIG).read_bytes() if (folder / RUN_CONFIG).is_file() else None
         (folder / RUN_CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False), encoding="utf-8")
     except OSError as error:
@@ -44,7 +44,7 @@ def run_folder(config: Any, kind: str, name: str = "") -> Iterator[Path]:
         raise
 
 
-def _made(folder: Path, *, is_new: bool) -> tuple[Path, list[Path]]:
+def made(folder: Path, *, is_new: bool) -> tuple[Path, list[Path]]:
     """Make a folder, or one beside it if it is to be new; return it, and what of its path was not there."""
     place, number = folder, 1
     while True:

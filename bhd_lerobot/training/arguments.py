@@ -16,6 +16,7 @@ from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options import parse as configuration
 from bhd_lerobot.policies.learned.contract import find_checkpoint
+from bhd_lerobot.training.checkpoint import last_checkpoint
 from bhd_lerobot.training.config import OWN_CONFIG_NAME, BhdTrainConfig
 
 
@@ -51,8 +52,8 @@ def _resumed(path: Path, output_dir: Any) -> Path:
 def resumed_checkpoint(path: Path) -> Path:
     """Return the folder of the checkpoint that a path means: a file in it, a folder of it, itself, or its run."""
     folder = path.parent if path.is_file() else path
-    for one in (folder.parent, folder, folder / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK):
-        if (one / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).is_file():
+    for one in (folder.parent, folder, last_checkpoint(folder)):
+        if one is not None and (one / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME).is_file():
             return one.resolve()
     raise ConfigError(
         f"No checkpoint to resume at {path}: neither {TRAIN_CONFIG_NAME} in it, nor in {PRETRAINED_MODEL_DIR}/, nor "
@@ -98,6 +99,8 @@ def config_of(values: dict[str, Any], checkpoint: Path | None = None) -> BhdTrai
         raise ConfigError("No dataset is given; set --dataset.root=FOLDER, or --dataset.repo_id=user/name.")
     if isinstance(dataset, dict) and dataset.get("root") and not dataset.get("repo_id"):
         values["dataset"] = {**dataset, "repo_id": local_name(dataset["root"])}
+    if isinstance(output_dir := values.get("output_dir"), str):
+        values["output_dir"] = str(Path(output_dir).expanduser())
     _start_from(values, resume=checkpoint is not None)
     selection = values.get("selection")
     if isinstance(selection, dict) and isinstance(selection.get("outcome"), str):

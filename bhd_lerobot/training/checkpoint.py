@@ -8,7 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    PRETRAINED_MODEL_DIR,
+    TRAINING_STATE_DIR,
+)
 
 from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, quoted
@@ -59,11 +64,21 @@ def load(checkpoint: Path, parts: TrainingParts) -> tuple[int, dict[str, Any]]:
 
 def clean(output_dir: Path) -> None:
     """Remove what a kill left of unfinished checkpoints."""
-    for path in (output_dir / "checkpoints").glob(".*"):
+    for path in (output_dir / CHECKPOINTS_DIR).glob(".*"):
         if path.is_symlink():
             path.unlink()
         else:
             shutil.rmtree(path, ignore_errors=True)
+
+
+def last_checkpoint(run: Path) -> Path | None:
+    """Return the folder of a run's last checkpoint, also where a copy lost the link, or made a folder of it."""
+    checkpoints = run / CHECKPOINTS_DIR
+    last = (checkpoints / LAST_CHECKPOINT_LINK).resolve()
+    if last.is_dir() and last.name.isdigit():
+        return last
+    numbered = [one for one in checkpoints.glob("*") if one.name.isdigit()]
+    return max(numbered, key=lambda one: int(one.name), default=None)
 
 
 def resume_command(checkpoint: Path) -> str:
@@ -98,10 +113,12 @@ def writing(final: Path) -> Iterator[Path]:
 
 def point(checkpoint: Path, name: str) -> None:
     """Have a link beside a checkpoint, such as `last`, lead to it."""
-    link = checkpoint.with_name(f".{name}.part")
+    link, target = checkpoint.with_name(f".{name}.part"), checkpoint.with_name(name)
     link.unlink(missing_ok=True)
     link.symlink_to(checkpoint.name)
-    Disk().move(link, checkpoint.with_name(name))
+    if target.is_dir() and not target.is_symlink():  # of a copy that followed the link
+        shutil.rmtree(target)
+    Disk().move(link, target)
 
 
 def _flush(folder: Path) -> None:

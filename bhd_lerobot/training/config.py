@@ -172,6 +172,7 @@ class BhdTrainConfig(TrainPipelineConfig):
             use_imagenet_stats=self.dataset.use_imagenet_stats,
             tolerance_s=self.tolerance_s,
             video_backend=self.dataset.video_backend,
+            depth_output_unit=self.dataset.depth_output_unit,
             budget_gib=self.budget_gib,
             num_workers=self.num_workers,
             **fields,

@@ -8,15 +8,24 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import yaml
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from bhd_lerobot.datasets.storage.disk import Disk
+from bhd_lerobot.options.parse import RUN_CONFIG
 
 METRICS_NAME = "metrics.jsonl"
 PLOT_NAME = "loss.png"
 
 Row = dict[str, Any]
+
+
+def write_config(folder: Path, values: dict[str, Any]) -> None:
+    """Write the configuration of a run into its folder: the file is there completely, or as before."""
+    text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=110)
+    Disk().publish(folder / RUN_CONFIG, text.encode())
+
 
 TIMING = ("data_s", "update_s", "steps_per_s", "samples_per_s", "eval_s")
 """Keys of a row that differ between two runs of the same seed."""

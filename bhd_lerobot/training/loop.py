@@ -64,7 +64,7 @@ class TrainingLoop:
     """Steps from where it is to the end.
 
     The first rows of metrics come earlier than `log_freq`, after 10, 20, 50 and 100 steps; the last step has a row, a
-    held-out loss and a checkpoint.
+    held-out loss and a checkpoint, and is never interrupted.
     """
 
     def __init__(
@@ -85,6 +85,7 @@ class TrainingLoop:
             "held_out": list(self.data.held_out_episodes),
             "fingerprint": self.data.fingerprint,
             "loader": self.loader.state_dict(),
+            "learner": self.learner.state_dict(),
             "window": self._window.numbers(),
         }
 
@@ -110,8 +111,11 @@ class TrainingLoop:
             )
         self.step = self._saved = step
         self._window = Window(before=list(state.get("window", [])))
+        self.learner.load_state_dict(state.get("learner", {}))
         if "loader" in state:
             self.loader.load_state_dict(state["loader"])
+        else:  # a checkpoint of lerobot-train
+            self.loader.seek(step)
 
     def run(self) -> None:
         """Train to the end, or until asked to stop; then a checkpoint of the last step exists."""
@@ -138,7 +142,7 @@ class TrainingLoop:
     def _between(self) -> None:
         step, options, hooks, held_out = self.step, self.config, self.hooks, self.data.held_out
         is_last = step == options.steps
-        self.interrupted = hooks.should_stop(step)
+        self.interrupted = not is_last and hooks.should_stop(step)
         is_extra = (options.log_freq > 0 and is_last) or (step in _EARLY and step < options.log_freq)
         is_log = _is_due(step, options.log_freq) or is_extra
         is_saving = _is_due(step, options.save_freq) or is_last
@@ -146,6 +150,8 @@ class TrainingLoop:
         row: Row = {"step": step, "epoch": step * self._batch_size / self.data.frames}
         if is_log:
             row |= self._measured()
+        elif options.log_freq == 0 and step % _EARLY[-1] == 0:
+            self._measured()  # what no row is made of is not kept
         began = time.perf_counter()
         if is_eval and held_out is not None:
             self._check()

@@ -8,21 +8,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import yaml
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 
 from bhd_lerobot.datasets.remote.errors import transfer_errors
-from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.errors import BhdError, ConfigError, TransferError
 from bhd_lerobot.hub.push import check_pushable
 from bhd_lerobot.hub.transfer import prompt_interrupt
-from bhd_lerobot.options.parse import RUN_CONFIG
 from bhd_lerobot.policies.learned.contract import CONTRACT_FILE
+from bhd_lerobot.rollout.run_folder import made
 from bhd_lerobot.stock import push_checkpoint_to_hub
 from bhd_lerobot.training import checkpoint
 from bhd_lerobot.training.checkpoint import TrainingParts
 from bhd_lerobot.training.config import BhdTrainConfig, without_places
-from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, read_metrics
+from bhd_lerobot.training.log import METRICS_NAME, PLOT_NAME, MetricsFile, Row, read_metrics, write_config
 from bhd_lerobot.training.plots import draw_loss
 
 
@@ -129,12 +127,12 @@ class RunOutput:
 
     def _open(self, step: int) -> MetricsFile:
         config, folder = self._config, self.folder
-        source = config.checkpoint_path.parent.parent if config.checkpoint_path else folder
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            folder, _ = made(folder, is_new=config.checkpoint_path is None)
+            self.folder = config.output_dir = folder
+            source = config.checkpoint_path.parent.parent if config.checkpoint_path else folder
             checkpoint.clean(folder)
-            text = yaml.safe_dump(config.plain(), sort_keys=False, default_flow_style=None, width=110)
-            Disk().publish(folder / RUN_CONFIG, text.encode())
+            write_config(folder, config.plain())
             config._save_pretrained(folder)
             return MetricsFile(folder / METRICS_NAME, read_metrics(source / METRICS_NAME, step))
         except OSError as error:

@@ -55,6 +55,16 @@ class Learner:
         self._update_buffers = self.unwrapped.update if has_method(self.unwrapped, "update") else None
         self.policy.train()
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the optimizer's state does not hold, as JSON values: of half precision the gradients' scale."""
+        scaler = self._accelerator.scaler
+        return {} if scaler is None else scaler.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue where `state_dict` was taken."""
+        if state and self._accelerator.scaler is not None:
+            self._accelerator.scaler.load_state_dict(state)
+
     @property
     def lr(self) -> float:
         """The learning rate."""

@@ -38,9 +38,10 @@ def print_start(console: Console, config: BhdTrainConfig, policy: Any, data: Tra
     )
     table.add_row("data", f"{counted(data.episodes, 'episode')}{held_out}, {data.frames:,} samples in an epoch")
     table.add_row("loader", escape(data.how))
-    epochs = config.steps * config.batch_size / data.frames
+    samples = config.batch_size * data.train.order.world_size
+    epochs = config.steps * samples / data.frames
     passes = f"{epochs:,.1f}" if epochs < 100 else f"{epochs:,.0f}"
-    table.add_row("steps", f"{config.steps:,} of {config.batch_size} samples: {passes} epochs")
+    table.add_row("steps", f"{config.steps:,} of {samples} samples: {passes} epochs")
     if step:
         table.add_row("resumed", f"after step {step}")
     table.add_row("run folder", escape(str(config.output_dir)))
@@ -63,7 +64,7 @@ def print_summary(console: Console, config: BhdTrainConfig, result: "TrainResult
         table.add_row("checkpoint", escape(str(result.checkpoint / PRETRAINED_MODEL_DIR)))
     console.print(table)
     lines = []
-    if result.stopped_by:
+    if result.stopped_by and result.step < config.steps:
         lines.append(
             f"Stopped by {result.stopped_by.name}. " + ("Continue with:" if result.checkpoint else "Nothing saved.")
         )

@@ -1,5 +1,6 @@
 """bhd-eval: the same bytes for any number of simulations and twice, the same episodes for every brain, and its ends."""
 
+import html
 import io
 import itertools
 import json
@@ -68,11 +69,15 @@ def whole(tmp_path_factory):
     return folder, result, printed
 
 
-def test_the_same_bytes_twice_and_for_any_number_of_simulations(whole, tmp_path):
+def test_the_same_bytes_by_the_command_in_the_report_and_for_any_number_of_simulations(whole):
     """`test_runs_are_recorded…` compares a third number of simulations."""
-    run_eval(tmp_path, n_episodes=9, n_envs=16, threads=2, **FAILING)
-    assert (tmp_path / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
-    with np.load(whole[0] / "initial_states.npz") as one, np.load(tmp_path / "initial_states.npz") as other:
+    command = re.search("<pre>(bhd-eval .*)</pre>", (whole[0] / "report.html").read_text(encoding="utf-8"))
+    assert command is not None
+    words = shlex.split(html.unescape(command[1]))
+    assert main([*words[1:], "--n_envs=16", "--threads=2"]) == 0
+    again = whole[0].with_name("whole_again")
+    assert (again / "results.json").read_bytes() == (whole[0] / "results.json").read_bytes()
+    with np.load(whole[0] / "initial_states.npz") as one, np.load(again / "initial_states.npz") as other:
         assert set(one.files) == {"state_old", "episode_old", "state_new", "episode_new"}
         assert all(np.array_equal(one[name], other[name]) for name in one.files)
 

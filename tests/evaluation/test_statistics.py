@@ -102,7 +102,7 @@ SCORES = {
 def test_intervals_of_scores_cover_the_truth_as_often_as_they_say_however_few_there_are(kind):
     rng = np.random.default_rng(5)
     truth = SCORES[kind](rng, 1_000_000).mean()
-    for count in (2, 5, 20, 50, 100):
+    for count in (1, 2, 5, 20, 50, 100):
         estimates = [mean(SCORES[kind](rng, count), within=(0.0, 1.0)) for _ in range(400)]
         assert sum(one.low <= truth <= one.high for one in estimates) >= 365  # of 400: three standard deviations
         assert all(0.0 <= one.low < one.high <= 1.0 for one in estimates)  # never without a width
@@ -180,7 +180,7 @@ def test_ratio_to_nothing_is_not_defined_and_to_nearly_nothing_is_open():
     assert open_above.high == math.inf
 
 
-def test_one_episode_has_no_interval_and_none_no_mean():
+def test_one_episode_has_no_interval_without_bounds_and_none_no_mean():
     one = mean([0.5])
     assert one.value == 0.5
     assert math.isnan(one.low)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file
@@ -325,13 +326,15 @@ def test_a_loss_that_is_not_a_number_stops_and_keeps_the_last_checkpoint(data, t
     assert result.step == 20
 
 
-def test_an_output_folder_that_exists(data: Path, tmp_path: Path) -> None:
+def test_an_output_folder_that_exists(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").touch()
     refused(options(data, tmp_path / "run"), ConfigError, r"run exists and holds no run to continue.*--output_dir\.")
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["precious"]
     with pytest.raises(ConfigError, match=r"File name too long.*--output_dir"):
         run_train(options(data, tmp_path / ("x" * 300)))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    refused(options(data, Path("~/run")), ConfigError, rf"The output folder {tmp_path / 'run'} exists")
 
 
 @each_case(
@@ -412,6 +415,19 @@ def test_a_run_goes_on_with_its_own_data_only_wherever_they_lie(tmp_path: Path, 
     shutil.move(root, tmp_path / "moved")
     result, _ = run_train([*again, "--steps=6", f"--dataset.root={tmp_path / 'moved'}"])
     assert result.step == 6
+
+
+def test_depth_is_served_in_the_unit_that_was_asked_for(data, tmp_path, monkeypatch):
+    units, make = [], LeRobotDataset.__init__
+
+    def made(self: LeRobotDataset, *args: Any, **options: Any) -> None:
+        units.append(options["depth_output_unit"])
+        make(self, *args, **options)
+
+    monkeypatch.setattr(LeRobotDataset, "__init__", made)
+    arguments = options(data, tmp_path / "run", MLP, steps=1, budget_gib=1e-9, dataset__depth_output_unit="m")
+    run_train(arguments)  # depth is not kept in memory
+    assert units == ["m"]
 
 
 def test_a_fingerprint_is_the_same_however_the_data_are_served(data: Path) -> None:

@@ -1,12 +1,19 @@
-"""What `bhd-train` says at its end."""
+"""What `bhd-train` says at its beginning and its end."""
 
+import io
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import torch
 from lerobot.configs import PreTrainedConfig
+from rich.console import Console
 
+from bhd_lerobot.datasets.loader.batches import BatchLoader
+from bhd_lerobot.datasets.loader.order import BatchOrder
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.parse import parse
@@ -23,7 +30,18 @@ from bhd_lerobot.tasks.pick import PickConfig
 from bhd_lerobot.tasks.reach import ReachConfig
 from bhd_lerobot.tasks.task import TaskConfig
 from bhd_lerobot.tasks.variation import RandomisationConfig
-from bhd_lerobot.training.summary import how_to_evaluate
+from bhd_lerobot.training.data import TrainingData
+from bhd_lerobot.training.summary import how_to_evaluate, print_start
+
+
+def test_epochs_count_the_samples_of_all_processes() -> None:
+    order = BatchOrder(torch.arange(100), 5, 0, world_size=4)
+    data = TrainingData(BatchLoader(None, order), None, 100, 2, [], "in memory", "")
+    policy: Any = SimpleNamespace(parameters=list, config=MlpConfig(device="cpu"))
+    config: Any = SimpleNamespace(steps=50, batch_size=5, output_dir="run")
+    console = Console(file=io.StringIO(), width=200)
+    print_start(console, config, policy, data, 0)
+    assert "50 of 20 samples: 10.0 epochs" in console.file.getvalue()
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,30 @@
+import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import draccus
 import pytest
 import torch
 import yaml
+from accelerate import Accelerator
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts import lerobot_train
 
 from bhd_lerobot.cli.train import main
 from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.training import checkpoint
+from bhd_lerobot.training import train as module
+from bhd_lerobot.training.config import BhdTrainConfig
+from bhd_lerobot.training.data import TrainingData, open_data
 from bhd_lerobot.training.log import MetricsFile
+from bhd_lerobot.training.setup import make_accelerator
+from bhd_lerobot.training.step import Learner, StepResult
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
 
 
@@ -59,9 +68,10 @@ def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
 def test_the_first_losses_are_those_of_lerobot_train(data, tmp_path, policy, monkeypatch):
-    result, _ = run_train(options(data, tmp_path / "ours", policy, steps=14, log_freq=1, save_freq=0))
+    result, _ = run_train(options(data, tmp_path / "ours", policy, log_freq=1, save_freq=0))
     values = json.loads((result.output_dir / "train_config.json").read_text())
     values |= {"output_dir": str(tmp_path / "stock"), "checkpoint_path": None, "optimizer": None, "scheduler": None}
+    values["save_freq"] = 12
     monkeypatch.setattr(sys, "argv", ["lerobot-train"])
     losses: list[float] = []
     original = lerobot_train.update_policy
@@ -76,6 +86,9 @@ def test_the_first_losses_are_those_of_lerobot_train(data, tmp_path, policy, mon
     assert [row["loss"] for row in curve(tmp_path / "ours")] == losses
     path = "checkpoints/last/pretrained_model/model.safetensors"
     assert (tmp_path / "ours" / path).read_bytes() == (tmp_path / "stock" / path).read_bytes()
+    # With one of its checkpoints `bhd-train` goes on where it was in its order of samples, 15 batches an epoch.
+    run_train(["--resume=true", f"--config_path={tmp_path / 'stock' / 'checkpoints' / '000012'}"])
+    assert curve(tmp_path / "stock") == curve(tmp_path / "ours")[12:]
 
 
 def test_evaluating_does_not_change_the_training(data: Path, tmp_path: Path) -> None:
@@ -115,6 +128,47 @@ def test_a_resumed_run_continues_to_the_same_bits(data, tmp_path, budget, monkey
     assert curve(tmp_path / "cut") == curve(tmp_path / "whole")
     weights = "checkpoints/last/pretrained_model/model.safetensors"
     assert (tmp_path / "cut" / weights).read_bytes() == (tmp_path / "whole" / weights).read_bytes()
+
+
+def test_the_scale_of_gradients_in_half_precision_goes_on_where_it_was(data, tmp_path, monkeypatch):
+    """Only a GPU computes with it; its scale is the same anywhere."""
+    scalers: list[torch.amp.GradScaler] = []
+
+    def half(config: BhdTrainConfig) -> Accelerator:
+        accelerator = make_accelerator(config)
+        accelerator.scaler = torch.amp.GradScaler("cpu", init_scale=16.0, growth_interval=5)
+        scalers.append(accelerator.scaler)
+        return accelerator
+
+    monkeypatch.setattr(module, "make_accelerator", half)
+    monkeypatch.setattr(Accelerator, "mixed_precision", property(lambda _: "fp16"))
+    run_train(options(data, tmp_path / "run", MLP, save_freq=12))
+    whole = curve(tmp_path / "run")
+    run_train(["--resume=true", f"--config_path={tmp_path / 'run' / 'checkpoints' / '000012'}"])
+    assert curve(tmp_path / "run") == whole
+    assert scalers[1].state_dict() == scalers[0].state_dict()
+    assert scalers[0].get_scale() == 16.0 * 2**4
+
+
+def test_what_is_not_logged_is_not_kept(data: Path, tmp_path: Path) -> None:
+    result, _ = run_train(options(data, tmp_path / "run", MLP, steps=104, log_freq=0, save_freq=0))
+    assert result.checkpoint is not None
+    assert len(json.loads((result.checkpoint / "training_state" / "bhd_loop.json").read_text())["window"]) == 4
+
+
+def test_a_signal_in_the_last_step_leaves_a_complete_run(data, tmp_path, hub, monkeypatch, capfd):
+    step, steps = Learner.step, itertools.count(1)
+
+    def pressed(self: Learner, batch: dict) -> StepResult:
+        if next(steps) == 5:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, batch)
+
+    monkeypatch.setattr(Learner, "step", pressed)
+    pushed = {"policy.repo_id": "me/p", "policy.push_to_hub": True}
+    assert main(options(data, tmp_path / "run", MLP | pushed, steps=5)) == 130
+    assert "model.safetensors" in hub.repositories["models/me/p"].files()
+    assert "--resume=true" not in capfd.readouterr().err  # there is nothing to continue
 
 
 def test_ctrl_c_saves_and_prints_the_resume_command(data, tmp_path, monkeypatch, capfd):
@@ -187,6 +241,29 @@ def test_a_finished_run_names_the_option_to_continue_and_resumes_where_it_was_mo
     result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'moved'}", "--steps=7"])
     assert (result.step, result.output_dir) == (7, tmp_path / "moved")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_is_resumed_where_a_copy_made_a_folder_of_a_link_or_lost_it(data: Path, tmp_path: Path) -> None:
+    run_train(options(data, tmp_path / "run", MLP, steps=4, save_freq=2))
+    followed, lost = (shutil.copytree(tmp_path / "run", tmp_path / name) for name in ("followed", "lost"))
+    shutil.rmtree(lost / "checkpoints" / "last")
+    for run in (followed, lost):
+        result, printed = run_train(["--resume=true", f"--config_path={run}", "--steps=6"])
+        assert "after step 4" in printed
+        assert result.step == 6
+        assert os.readlink(run / "checkpoints" / "last") == "000006"
+
+
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(data, tmp_path, monkeypatch):
+    def meanwhile(*args: Any, **kwargs: Any) -> TrainingData:
+        (tmp_path / "run").mkdir()
+        return open_data(*args, **kwargs)
+
+    monkeypatch.setattr(module, "open_data", meanwhile)
+    result, printed = run_train(options(data, tmp_path / "run", MLP, steps=1))
+    assert result.output_dir == tmp_path / "run_2"
+    assert str(result.output_dir) in printed
+    assert list((tmp_path / "run").iterdir()) == []
 
 
 def test_only_the_chosen_episodes_and_frames_are_learned_from(data: Path, tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ class LoaderConfig(Options):
         return_uint8: serve videos as uint8, which `lerobot-train` divides by 255 afterwards, instead of float32.
         tolerance_s: by how much a video frame may miss its time [s].
         video_backend: LeRobot's decoder whose pixels are served.
+        depth_output_unit: in which unit LeRobot's dataset serves what depth cameras measure: `mm` or `m`.
         keep: features to serve besides the index columns; None serves all. LeRobot's dataset always serves all.
         budget_gib: memory that columns and decoded images may take [GiB].
         num_workers: processes of PyTorch's `DataLoader`, where LeRobot's dataset is used.
@@ -67,6 +68,7 @@ class LoaderConfig(Options):
     return_uint8: bool = True
     tolerance_s: Positive = 1e-4
     video_backend: str | None = "pyav"
+    depth_output_unit: Annotated[str, OneOf(("mm", "m"))] = "mm"
     keep: Collection[str] | None = None
     budget_gib: Annotated[float, Range("(0, inf]")] = 4.0
     num_workers: Whole = 0

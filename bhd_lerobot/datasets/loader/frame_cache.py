@@ -1,5 +1,6 @@
 """Camera frames of a dataset, decoded once and kept in memory as 8-bit images."""
 
+import contextlib
 import io
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 GIB = 2**30
 _MEMORY = Path("/proc/meminfo")
-_CGROUP = Path("/sys/fs/cgroup")
+_CGROUP, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def image_shape(meta: "LeRobotDatasetMetadata", key: str) -> tuple[int, int, int]:
@@ -53,18 +54,23 @@ def needed_bytes(
 
 
 def available_memory() -> int:
-    """Return the bytes that this process can still get, from the system and from its control group."""
+    """Return the bytes that this process can still get, from the system and from its control group and those above."""
     free = [os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     if _MEMORY.is_file():
         for line in _MEMORY.read_text(encoding="utf-8").splitlines():
             if line.startswith("MemAvailable:"):
                 free = [int(line.split()[1]) * 1024]
-    try:
-        limit = (_CGROUP / "memory.max").read_text(encoding="utf-8").strip()
-        if limit != "max":
-            free.append(int(limit) - int((_CGROUP / "memory.current").read_text(encoding="utf-8")))
-    except (OSError, ValueError):
-        pass  # another system, or no control group
+    lines = _OWN_CGROUP.read_text(encoding="utf-8").splitlines() if _OWN_CGROUP.is_file() else []
+    own = "".join(line[3:] for line in lines if line.startswith("0::")).strip("/")
+    group = _CGROUP / own  # a container sees its own as the topmost; that of a batch job is below
+    for one in (group, *group.parents):
+        with contextlib.suppress(OSError, ValueError):  # another system, or no limit
+            limit = int((one / "memory.max").read_text())
+            used = int((one / "memory.current").read_text())
+            kinds = (line.split() for line in (one / "memory.stat").read_text().splitlines())
+            # Files that were read are given up for whatever needs memory, as the system itself counts it.
+            cached = sum(int(size) for kind, size in kinds if kind in ("active_file", "inactive_file"))
+            free.append(limit - used + cached)
     return max(min(free), 0)
 
 

@@ -173,6 +173,7 @@ def _lerobot_dataset(
         revision=meta.revision,
         video_backend=config.video_backend,
         return_uint8=config.return_uint8,
+        depth_output_unit=config.depth_output_unit,
     )
     dataset.meta.stats, dataset.meta.tasks, dataset.meta.episodes = meta.stats, meta.tasks, meta.episodes
     _check_positions(dataset, sorted(episodes), reason)

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shlex
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -10,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from rich.console import Console
 from rich.table import Table
 
@@ -18,7 +18,7 @@ from bhd_lerobot.datasets.edit.edits import delete, merge
 from bhd_lerobot.datasets.format.features import EXPERT_ACTION
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
-from bhd_lerobot.errors import BhdError, ConfigError, quoted
+from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.evaluation.evaluate import evaluate
 from bhd_lerobot.options.command import Program, run
@@ -26,6 +26,7 @@ from bhd_lerobot.options.parse import RUN_CONFIG, encode, read_file
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
 from bhd_lerobot.training import train as training
+from bhd_lerobot.training.checkpoint import last_checkpoint
 from bhd_lerobot.training.dagger.config import (
     FILES,
     OWN,
@@ -194,11 +195,10 @@ class _Rounds:
         table.add_row("", "", self._stages.expert, *level, "")
         self._console.print(table)
         policy = self._policy(max(self._rows))
-        evaluation = " ".join([self._config.evaluation.config, *self._config.evaluation.options])
+        evaluation = command(self._config.evaluation, {"brains.policy.type": "learned", "brains.policy.path": policy})
         self._console.print(
             f"Policies, data and curve: {self._folder}. Evaluate the last policy on unused episodes:\n"
-            f"  bhd-eval --config_path={evaluation} --brains.policy.type=learned "
-            f"--brains.policy.path={quoted(policy)}",
+            f"  {shlex.join(['bhd-eval', *evaluation])}",
             soft_wrap=True,
             markup=False,
             highlight=False,
@@ -225,7 +225,7 @@ class _Rounds:
 
     def _train(self, number: int, folder: Path) -> None:
         run_folder = folder / "policy"
-        if (last := _last_checkpoint(run_folder)) is not None:
+        if (last := last_checkpoint(run_folder)) is not None:
             if int(last.name) >= self._stages.steps:
                 return  # it was stopped between its last checkpoint and the note of it
             data = f"--dataset.root={self._data_at(number, folder)}"  # the run may have been moved
@@ -287,7 +287,7 @@ class _Rounds:
     # --- programs ----------------------------------------------------------------------------------------------------
 
     def _call(self, number: int, program: str, arguments: Sequence[str]) -> None:
-        self._say(number, f"{program} {' '.join(arguments)}")
+        self._say(number, shlex.join([program, *arguments]))
         status = _PROGRAMS[program](arguments)
         if status:
             again = (
@@ -348,16 +348,6 @@ def _reported(folder: Path) -> dict[int, dict[str, Any]]:
         return {row["round"]: row for row in json.loads(file.read_text(encoding="utf-8"))["rounds"]}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-
-
-def _last_checkpoint(run_folder: Path) -> Path | None:
-    """Return the folder of a training's last checkpoint, which a copy may have lost the link to; None without one."""
-    checkpoints = run_folder / CHECKPOINTS_DIR
-    last = (checkpoints / LAST_CHECKPOINT_LINK).resolve()
-    if last.is_dir() and last.name.isdigit():
-        return last
-    numbered = [one for one in checkpoints.glob("*") if one.name.isdigit()]
-    return max(numbered, key=lambda one: int(one.name), default=None)
 
 
 def _level(brain: dict[str, Any]) -> dict[str, Any]:

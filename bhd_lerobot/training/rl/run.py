@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
+from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
 from rich.console import Console
 from rich.markup import escape
 from stable_baselines3.common.callbacks import BaseCallback
@@ -32,8 +31,16 @@ from bhd_lerobot.rollout.signals import StopRequest
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.stock import load_rng_state, save_rng_state
 from bhd_lerobot.tasks.task import Event, episode_seed
-from bhd_lerobot.training.checkpoint import clean, point, writing
-from bhd_lerobot.training.log import METRICS_NAME, MetricsFile, Row, RunProgress, format_numbers, read_metrics
+from bhd_lerobot.training.checkpoint import clean, last_checkpoint, point, writing
+from bhd_lerobot.training.log import (
+    METRICS_NAME,
+    MetricsFile,
+    Row,
+    RunProgress,
+    format_numbers,
+    read_metrics,
+    write_config,
+)
 from bhd_lerobot.training.plots import draw_learning
 from bhd_lerobot.training.rl.config import RlConfig
 from bhd_lerobot.training.rl.environment import RlVecEnv
@@ -121,17 +128,15 @@ class Run(BaseCallback):
             raise ConfigError(
                 f"The run has done {result.step} of {config.steps} steps. To continue, set more with --steps."
             )
-        values = json.loads(json.dumps({**configuration.encode(config), "resume": False}))
-        text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=110)
-        (result.output_dir / configuration.RUN_CONFIG).write_text(text, encoding="utf-8")
+        write_config(result.output_dir, {**configuration.encode(config), "resume": False})
         self._metrics = MetricsFile(result.output_dir / METRICS_NAME, rows)
         self._minutes_before = rows[-1]["minutes"] if rows else 0.0
         result.rows = self._metrics.rows
         self._point_to_best()
         left = max(0, config.steps - learner.num_timesteps)
         with RunProgress(self._console, "learning", config.steps, result.step) as self._progress:
-            if not config.resume:
-                self._judge({})
+            if not any(row["step"] == result.step and "val_score" in row for row in rows):
+                self._judge({})  # also what a kill, or a stop, kept from being judged
             try:
                 learner.learn(left, callback=self, log_interval=_NEVER, reset_num_timesteps=False)
             except ValueError as error:
@@ -192,12 +197,13 @@ class Run(BaseCallback):
         return list(EpisodeLoop(simulation, task, make_brain(brain)).run(specs, self._stop.__bool__))
 
     def _judge(self, row: Row) -> None:
-        """Save, and, unless the run is to stop, find out how good the policy is."""
+        """Save what is not saved yet, and, unless the run is to stop, find out how good the policy is."""
         result = self._result
-        following = max(member.sequence.following for member in self._env.members)
-        result.checkpoint = save(result.output_dir, self._parts, self.model, following)
-        self._saved = result.step
-        policy = LearnedBrainConfig(path=str(result.checkpoint / PRETRAINED_MODEL_DIR))
+        if self._saved != result.step:
+            following = max(member.sequence.following for member in self._env.members)
+            result.checkpoint = save(result.output_dir, self._parts, self.model, following)
+            self._saved = result.step
+        policy = LearnedBrainConfig(path=str(_folder_of(result.output_dir, result.step) / PRETRAINED_MODEL_DIR))
         found = {} if self._stop else level(self._validate(policy))
         if row := {**row, **({} if self._stop else found)}:
             self._log(row)
@@ -252,7 +258,7 @@ class Run(BaseCallback):
             lines.append(f"best, after {best['step']:,} steps: {text.format_map(best)}")
             lines.append(f"best checkpoint: {result.best / PRETRAINED_MODEL_DIR}")
         lines.append(f"curve: {result.output_dir / PLOT_NAME}")
-        if self._stop:
+        if self._stop and result.step < self._config.steps:
             lines.append(
                 f"Stopped by {self._stop.name}. Continue with: bhd-train --resume=true "
                 f"--config_path={quoted(result.output_dir)}"
@@ -341,4 +347,6 @@ def load(output_dir: Path, learner: Any) -> None:
 
 
 def _last(output_dir: Path) -> Path:
-    return (output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK).resolve()
+    if (last := last_checkpoint(output_dir)) is None:
+        raise ConfigError(f"There is no run to resume in {output_dir}: it has no checkpoint.")
+    return last

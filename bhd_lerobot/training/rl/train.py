@@ -78,7 +78,7 @@ def _run_folder(config: RlConfig) -> Path:
     try:
         if config.resume and not folder.is_dir():
             raise ConfigError(f"There is no run to resume in {folder}.")
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=config.resume)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:  # also a name that is too long
         raise ConfigError(f"The run folder {folder} cannot be written: {error.strerror}. Set --output_dir.") from error

@@ -281,11 +281,17 @@ def test_available_memory_respects_the_control_group(tmp_path: Path, monkeypatch
     (tmp_path / "meminfo").write_text("MemTotal: 9 kB\nMemAvailable:   4000 kB\n")
     monkeypatch.setattr(frame_cache, "_MEMORY", tmp_path / "meminfo")
     monkeypatch.setattr(frame_cache, "_CGROUP", tmp_path)
+    monkeypatch.setattr(frame_cache, "_OWN_CGROUP", tmp_path / "self")
     assert frame_cache.available_memory() == 4000 * 1024
-    (tmp_path / "memory.current").write_text("1000\n")
-    for limit, wanted in (("max", 4000 * 1024), ("5000", 4000), ("500", 0)):
-        (tmp_path / "memory.max").write_text(limit + "\n")
-        assert frame_cache.available_memory() == wanted
+    # A container sees its own group as the topmost; that of a batch job is below.
+    for own in (tmp_path, tmp_path / "slurm" / "job_1"):
+        own.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "self").write_text(f"1:name=systemd:/\n0::/{own.relative_to(tmp_path)}\n")
+        (own / "memory.current").write_text("1000\n")
+        (own / "memory.stat").write_text("anon 200\nfile 800\nshmem 50\ninactive_file 500\nactive_file 250\n")
+        for limit, wanted in (("200", 0), ("5000", 4750), ("max", 4000 * 1024)):
+            (own / "memory.max").write_text(limit + "\n")
+            assert frame_cache.available_memory() == wanted
 
 
 def test_a_video_that_lacks_frames_is_named(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import yaml
 from bhd_lerobot.cli.train import algorithm_of, main
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.errors import BhdError
-from bhd_lerobot.options.parse import read_line
+from bhd_lerobot.evaluation.config import EvalConfig
+from bhd_lerobot.options.parse import parse, read_line
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
 from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.training.dagger import train as dagger
@@ -40,12 +42,12 @@ def settings(folder: Path, **changed: Any) -> Path:
             "record/turtlebot3_avoid_dagger", *record, "--brain.expert.margin_m=0.08", "--brain.learner.exact=true"
         ),
         "policy": stage("train/bc_turtlebot3_avoid", *training, "--selection.learner_weight=0.5"),
-        "evaluation": stage("eval/turtlebot3_avoid", *BRIEF, "--n_envs=2"),
+        "evaluation": stage("eval/turtlebot3_avoid", *BRIEF, "--n_envs=2", "--ray={num_workers: null}"),
         "output_dir": str(folder / "run"),
         "rounds": 1,
         "expert_episodes": 2,
         "episodes": 2,
-        "validation_episodes": 2,
+        "validation_episodes": 1,
         **changed,
     }
     file = folder / "dagger.yaml"
@@ -104,8 +106,10 @@ def test_rounds_learn_from_all_that_was_recorded_and_go_on_where_they_stopped(tm
     for one in (found["expert"], *found["rounds"]):
         assert 0 <= one["success"]["low"] <= one["success"]["value"] <= one["success"]["high"] <= 1
     assert (run / "rounds.png").exists()
-    report = capsys.readouterr().err
-    assert "--brains.policy.path=" in report
+    printed = capsys.readouterr().err.splitlines()
+    (said,) = (line for line in printed if line.startswith("  bhd-eval ") and "--brains.policy.path=" in line)
+    said_brain = parse(EvalConfig, shlex.split(said)[1:]).brains["policy"]
+    assert said_brain.path == str(run / "round_1" / "policy")
 
     # Nothing is left to do, nor where an option is not in the folder's file; another seed would be other rounds.
     called.clear()

@@ -20,6 +20,7 @@ pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
 
 from bhd_lerobot.cli.train import main
+from bhd_lerobot.datasets.storage.disk import Disk
 from bhd_lerobot.envs.episodes import SteppedEpisodes
 from bhd_lerobot.envs.vector import BhdVectorEnv
 from bhd_lerobot.errors import BhdError, ConfigError
@@ -133,8 +134,10 @@ def test_a_run_is_resumed_whatever_became_of_what_it_started_from(finished: RlRe
     start = shutil.copytree(Path(finished.checkpoint) / "pretrained_model", tmp_path / "start")
     run(tmp_path / "run", start_from=start, steps=32)
     shutil.rmtree(start)
-    again = parse_rl([f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64"])
+    copied = shutil.copytree(tmp_path / "run", tmp_path / "copied")  # which makes folders of links
+    again = parse_rl([f"--config_path={copied}", "--resume=true", "--steps=64"])
     assert train(again, Console(file=io.StringIO())).step == 64
+    assert (copied / "checkpoints" / "last").readlink().name == "000000064"
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_others(finished: RlResult, tmp_path: Path) -> None:
@@ -162,16 +165,16 @@ def test_what_cannot_be_resumed_is_refused_and_a_torn_checkpoint_is_never_loaded
         train(parse_rl(command), Console(file=io.StringIO()))
 
 
-def dying(name: str, calls: int, arguments: list[str]) -> int:
-    """Train, and die in a function of the checkpoints after some calls of it."""
-    left, function = iter(range(calls)), getattr(checkpoints, name)
+def dying(owner: Any, name: str, calls: int, arguments: list[str]) -> int:
+    """Train, and die in a function after some calls of it."""
+    left, function = iter(range(calls)), getattr(owner, name)
 
     def die(*values: Any) -> Any:
         if next(left, None) is None:
             os.kill(os.getpid(), signal.SIGKILL)
         return function(*values)
 
-    setattr(checkpoints, name, die)
+    setattr(owner, name, die)
     return main(arguments)
 
 
@@ -180,9 +183,13 @@ def test_a_run_that_is_killed_while_it_saves_goes_on_from_the_last_complete_chec
     again = [f"--config_path={folder}", "--resume=true"]
     # The second checkpoint first before it is renamed, then before `last` leads to it.
     for name, calls, arguments in (("_flush", 1, options(folder)), ("point", 0, again)):
-        killed = Fork(dying, name, calls, arguments, output=tmp_path / "log")
+        killed = Fork(dying, checkpoints, name, calls, arguments, output=tmp_path / "log")
         assert killed.wait() == -signal.SIGKILL, (tmp_path / "log").read_text()
         assert (folder / "checkpoints" / "last").readlink().name == "000000000"
+    # And where it has not been judged yet: it may be the best one.
+    killed = Fork(dying, module.Run, "_validate", 0, again, output=tmp_path / "log")
+    assert killed.wait() == -signal.SIGKILL, (tmp_path / "log").read_text()
+    assert (folder / "checkpoints" / "last").readlink().name == "000000064"
     assert main(again) == 0
     assert {one.name for one in (folder / "checkpoints").iterdir()} == {
         *("000000000", "000000064", "000000096"),
@@ -394,6 +401,21 @@ def test_weights_that_are_not_finite_end_the_run(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(PPO, "learn", spoil)
     with pytest.raises(BhdError, match=r"weights are not finite .*000000000 is intact.*--ppo\.lr"):
         run(tmp_path / "run")
+
+
+def test_a_full_disk_leaves_the_configuration_that_a_run_is_resumed_with(tmp_path, monkeypatch):
+    run(tmp_path / "run", steps=32)
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+
+    def full(path: Path, *_: Any, **__: Any) -> None:
+        path.write_bytes(b"")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Disk, "write", lambda _, path, content: full(path))
+    with pytest.raises(BhdError, match="No space left on device"):
+        train(parse_rl([f"--config_path={tmp_path / 'run'}", "--resume=true", "--steps=64"]))
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
 
 
 def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
