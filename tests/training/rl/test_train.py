@@ -165,8 +165,9 @@ def test_what_cannot_be_resumed_is_refused_and_a_torn_checkpoint_is_never_loaded
         train(parse_rl(command), Console(file=io.StringIO()))
 
 
-def dying(owner: Any, name: str, calls: int, arguments: list[str]) -> int:
-    """Train, and die in a function after some calls of it."""
+def dying(name: str, calls: int, arguments: list[str]) -> int:
+    """Train, and die in a function of the run, or of its checkpoints, after some calls of it."""
+    owner: Any = module.Run if hasattr(module.Run, name) else checkpoints
     left, function = iter(range(calls)), getattr(owner, name)
 
     def die(*values: Any) -> Any:
@@ -183,11 +184,11 @@ def test_a_run_that_is_killed_while_it_saves_goes_on_from_the_last_complete_chec
     again = [f"--config_path={folder}", "--resume=true"]
     # The second checkpoint first before it is renamed, then before `last` leads to it.
     for name, calls, arguments in (("_flush", 1, options(folder)), ("point", 0, again)):
-        killed = Fork(dying, checkpoints, name, calls, arguments, output=tmp_path / "log")
+        killed = Fork(dying, name, calls, arguments, output=tmp_path / "log")
         assert killed.wait() == -signal.SIGKILL, (tmp_path / "log").read_text()
         assert (folder / "checkpoints" / "last").readlink().name == "000000000"
     # And where it has not been judged yet: it may be the best one.
-    killed = Fork(dying, module.Run, "_validate", 0, again, output=tmp_path / "log")
+    killed = Fork(dying, "_validate", 0, again, output=tmp_path / "log")
     assert killed.wait() == -signal.SIGKILL, (tmp_path / "log").read_text()
     assert (folder / "checkpoints" / "last").readlink().name == "000000064"
     assert main(again) == 0
