@@ -109,6 +109,28 @@ def test_a_chunk_does_what_its_actions_sent_one_by_one_do(kind: str, length: int
             np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
 
 
+class Interrupted(Script):
+    """Gives a chunk in the first frame, whose rows are the script's for three frames, and single rows after these."""
+
+    def act(self, observation: Any) -> Any:
+        frame, self.frame = self.frame, self.frame + 1
+        n = len(observation.state)
+        if frame > 2:
+            return np.tile(self.rows[frame], (n, 1))
+        rows = np.concatenate([self.rows[:3], np.tile(self.rows[0], (20, 1))])
+        return None if frame else Chunk(np.tile(rows[:, None], (1, n, 1)))
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("kind", ["turtlebot3", "ur5"])
+def test_an_action_takes_the_place_of_what_is_left_of_a_chunk(kind: str) -> None:
+    """As where a person takes over from a policy that streams."""
+    rows = script(kind)
+    for first, second in zip(run(kind, Script(rows)), run(kind, Interrupted(rows)), strict=True):
+        for key, column in first.columns.items():
+            np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
+
+
 class Once(Script):
     """Gives an arm a goal in the first frame, and goes on with it."""
 
