@@ -8,6 +8,7 @@ from typing import Any
 
 import draccus
 import numpy as np
+from lerobot.robots.config import RobotConfig
 from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Command
@@ -66,8 +67,8 @@ class TeleopBrain(Brain):
                     f"The teleoperator {teleop_type!r} cannot be connected: {as_text(error)}. Check its power, its "
                     "cable and its port, and that no other program uses it."
                 ) from error
-        is_ours = robot.body is not None, type(self.teleop).__module__.startswith(_OURS)
-        if all(is_ours) and (learn := getattr(self.teleop, "learn", None)) is not None:
+        is_ours = _is_ours(robot), type(self.teleop).__module__.startswith(_OURS)
+        if robot.body is not None and is_ours[1] and (learn := getattr(self.teleop, "learn", None)) is not None:
             learn(robot.body)
         features = tuple(self.teleop.action_features)
         if set(features) == {"dtype", "shape", "names"}:  # the other form in which LeRobot's teleoperators say it
@@ -176,6 +177,12 @@ class TeleopBrain(Brain):
             except Exception as error:  # of another package's code: what was recorded is reported all the same
                 kind = self.config.teleop.type
                 print(f"warning: the teleoperator {kind} could not be disconnected: {as_text(error)}", file=sys.stderr)
+
+
+def _is_ours(robot: RobotFeatures) -> bool:
+    """Return whether a robot is of this package: its numbers are in SI units, as those of ROS are."""
+    kind = RobotConfig.get_known_choices().get(robot.robot_type)
+    return robot.body is not None or (kind is not None and kind.__module__.startswith(_OURS))
 
 
 def _held(robot: RobotFeatures, known: Sequence[str]) -> list[str]:

@@ -15,6 +15,9 @@ from bhd_lerobot.errors import BrainStoppedError, ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.teleop.brain import TeleopBrain
 from bhd_lerobot.policies.teleop.config import TeleopConfig
+from bhd_lerobot.ros2.robots.config_robot import Ros2RobotConfig
+from bhd_lerobot.teleoperators.bhd_keyboard_base import BhdKeyboardBase
+from bhd_lerobot.teleoperators.config_bhd_keyboard_base import BhdKeyboardBaseConfig
 from tests.robots.external.mock_devices.devices import JOINTS, MockLeaderConfig
 
 ONLY = np.zeros(1, np.intp)
@@ -92,3 +95,20 @@ def test_of_an_arm_on_a_base_the_part_that_a_teleoperator_does_not_give_is_held(
     held = {name: 0.0 if name in speeds else value for name, value in zip(names, seen.state[0], strict=True)}
     for action in actions:
         assert action.tolist() == [[9.0 if name in driven else held[name] for name in names]]  # type: ignore[union-attr]
+
+
+@pytest.mark.law
+def test_the_numbers_of_a_ros_2_robot_are_in_si_units_as_those_of_our_teleoperators_and_no_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ros2 = Ros2RobotConfig.get_choice_name(Ros2RobotConfig)
+    monkeypatch.setattr(BhdKeyboardBase, "connect", lambda self: None)  # which needs a terminal
+    with closing(TeleopBrain(TeleopConfig(BhdKeyboardBaseConfig()))) as brain:
+        names = ("x.vel", "theta.vel")
+        brain.bind(RobotFeatures(names, names, 10, robot_type=ros2))
+        assert brain._map({"x.vel": 0.1, "theta.vel": 0.2}) == {"x.vel": 0.1, "theta.vel": 0.2}
+    with (
+        closing(TeleopBrain(TeleopConfig(MockLeaderConfig()))) as brain,
+        pytest.raises(ConfigError, match=r"both have 'shoulder\.pos'.*degrees and radians"),
+    ):
+        brain.bind(RobotFeatures(JOINTS, JOINTS, 50, robot_type=ros2))
