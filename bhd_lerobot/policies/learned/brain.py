@@ -75,7 +75,7 @@ class LearnedBrain(Brain):
         self._recorded_path = recorded_path(config.path, folder)
         self.contract = PolicyContract.load(folder)
         self.loaded = load_policy(folder, config.device, config.n_action_steps)
-        self.uses_images = bool(self.loaded.cameras)
+        self.uses_images = bool(self._cameras)
         self.uses_privileged_state = _ENVIRONMENT in self.loaded.inputs
         self.inference = make_inference(self.loaded, sample=config.sample, exact=config.exact, threads=config.threads)
         if config.stream and self.inference.steps == 1:
@@ -198,6 +198,18 @@ class LearnedBrain(Brain):
         is_due = self._next >= self.inference.steps
         return self.uses_images & (is_due & (self._frame == 0) if self.inference.looks_once else is_due)
 
+    @property
+    def _cameras(self) -> dict[str, str]:
+        """The cameras that it looks through, by key; images of those that its training data lacked it makes up."""
+        if not getattr(self.loaded.config, "empty_cameras", 0):
+            return self.loaded.cameras
+        known = self.contract.cameras
+        return {
+            key: camera
+            for key, camera in self.loaded.cameras.items()
+            if (not camera.startswith("empty_camera") if known is None else camera in known)
+        }
+
     def _rows(self, observation: Observation, is_looking: bool) -> "Rows":
         """Return the policy's inputs of all simulations, shape (n, …); images if it looks."""
         if is_looking:
@@ -210,13 +222,13 @@ class LearnedBrain(Brain):
                 if observation.environment_state is None:
                     raise AssertionError("The brain was bound to a task that tells something.")
                 rows[key] = observation.environment_state.astype(np.float32)
-            elif is_looking:
-                rows[key] = observation.images[self.loaded.cameras[key]]
+            elif is_looking and key in self._cameras:
+                rows[key] = observation.images[self._cameras[key]]
         return rows
 
     def _check_cameras(self, cameras: Mapping[str, tuple[int, ...]]) -> None:
         """Check that the cameras that the policy looks at are there, with images of the shape that it knows."""
-        for key, camera in self.loaded.cameras.items():
+        for key, camera in self._cameras.items():
             shape = tuple((self.contract.cameras or {}).get(camera, ())) or self._own_shape(key)
             if camera not in cameras:
                 size = f" --robot.camera_width={shape[1]} --robot.camera_height={shape[0]}" if shape else ""

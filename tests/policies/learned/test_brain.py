@@ -1,5 +1,6 @@
 """The learned brain: LeRobot's own actions to the bit, and episodes that do not feel each other."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,23 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.policies.brain import Observation
+from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.learned.brain import LearnedBrain
+from bhd_lerobot.policies.learned.contract import PolicyContract
 from bhd_lerobot.policies.learned.inference import StockInference
-from tests.policies.learned.rig import ACTIONS, INSTRUCTION, KINDS, Stock, make_brain, observations, save_policy
+from tests.policies.learned.rig import (
+    ACTIONS,
+    ENVIRONMENT,
+    FPS,
+    IMAGE,
+    INSTRUCTION,
+    KINDS,
+    STATE,
+    Stock,
+    make_brain,
+    observations,
+    save_policy,
+)
 
 FRAMES = 11
 
@@ -199,3 +213,20 @@ def test_images_that_it_does_not_look_at_need_not_be_there(checkpoints, kind, fr
         images = one.images if frame in frames else {}
         action = brain.act(Observation(one.names, one.state, images, one.environment_state, running=running))
         assert np.array_equal(np.asarray(action)[:2], wanted[frame, :2])
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("is_known", [True, False])
+def test_images_of_cameras_that_its_training_data_lacked_are_not_asked_for(checkpoints, is_known):
+    """LeRobot's vision-language-action policies make them up, as many as their `empty_cameras` says."""
+    wanted = drive(make_brain(checkpoints["act_image"]), seen := list(observations(1, 4)), [0])
+    brain = make_brain(checkpoints["act_image"])
+    empty, brain.loaded.config.empty_cameras = "observation.images.empty_camera_0", 1
+    cameras = {**brain.loaded.cameras, empty: "empty_camera_0"}
+    brain.loaded = replace(brain.loaded, inputs=(*brain.loaded.inputs, empty), cameras=cameras)
+    if not is_known:
+        brain.contract = PolicyContract()
+    brain.bind(RobotFeatures(STATE, ACTIONS, FPS, ENVIRONMENT, cameras={"front": IMAGE}))
+    assert np.array_equal(drive(brain, seen, [0]), wanted)
+    with pytest.raises(ConfigError, match="uses the camera 'front'"):
+        brain.bind(RobotFeatures(STATE, ACTIONS, FPS, ENVIRONMENT, cameras={}))
