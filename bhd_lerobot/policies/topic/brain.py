@@ -57,11 +57,12 @@ class TopicBrain(Brain):
         self._link.open(patience_s=None)
 
     def _default(self, robot: RobotFeatures) -> MappingConfig:
-        if robot.body and robot.body.drive:
-            msgtype = TWIST_TYPE if self.config.network.distro == "humble" else STAMPED_TWIST
-            return MappingConfig(action=entries(BASE_TOPIC, msgtype, robot.action_names))
-        numbered = enumerate(robot.action_names)
-        return MappingConfig(action={name: FieldConfig(TOPIC, _FLOATS, f"data[{k}]") for k, name in numbered})
+        speeds = robot.body.drive.limits.names if robot.body and robot.body.drive else ()
+        msgtype = TWIST_TYPE if self.config.network.distro == "humble" else STAMPED_TWIST
+        driven = [name for name in robot.action_names if name in speeds]
+        numbered = enumerate(name for name in robot.action_names if name not in speeds)
+        others = {name: FieldConfig(TOPIC, _FLOATS, f"data[{k}]") for k, name in numbered}
+        return MappingConfig(action=entries(BASE_TOPIC, msgtype, driven) | others)
 
     def reset(self, ids: NDArray[np.intp], seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         """Start an episode: another node, which may just have found this one, is given time to send a setpoint.

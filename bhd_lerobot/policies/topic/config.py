@@ -15,7 +15,7 @@ class TopicConfig(BrainConfig):
     Attributes:
         mapping: YAML file whose section `action` says which field of which topic is which action, see "Use ROS 2".
             Without it a base is driven by ``/brain/cmd_vel``, TwistStamped, or Twist with `network.distro` humble, and
-            another robot by the values of ``/brain/commands``, a Float64MultiArray in the order of its actions.
+            joints by the values of ``/brain/commands``, a Float64MultiArray in the order of the other actions.
         network: where the node is.
         command_timeout_s: a message that is older gives no setpoint; the robot then stops by its own time-out [s].
         timeout_s: without a message for so long the episode ends with a fault [s].

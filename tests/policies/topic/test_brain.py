@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
+from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.errors import BrainStoppedError, ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.topic.brain import TopicBrain
@@ -92,6 +94,16 @@ def test_another_robot_is_driven_by_numbers_in_order_or_by_a_mapping(node: Node,
         with begun(TopicConfig(path, node.network), features(None, "a.pos", "b.pos")) as brain:
             send = lambda: publisher.send(floats.encode(np.array([1.0, 2.0]), 0))  # noqa: E731
             assert act(brain, send, lambda found: found is not None).tolist() == expected
+
+
+def test_of_an_arm_on_a_base_twists_drive_the_base_and_numbers_the_arm(node: Node) -> None:
+    body = turtlebot3_manipulation()
+    names, speeds = body.limits.names, body.need(Drive).limits.names
+    with begun(TopicConfig(network=node.network), features(body, *names)) as brain:
+        assert [[names[column] for column in columns] for columns in brain._columns] == [
+            list(speeds),
+            [name for name in names if name not in speeds],
+        ]
 
 
 @pytest.mark.law
