@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
@@ -114,6 +114,8 @@ class TrainedConfig(PreTrainedConfig):
             raise ConfigError(
                 f"policy.ignored_columns is {self.ignored_columns}; {OBS_STATE} has the columns 0 to {width - 1}."
             )
+        if self.residual:
+            self.check_scale("STATE", "ACTION")
         columns, actions = self.residual_columns, int(self.action_feature.shape[0])
         if self.residual and (len(columns) != actions or max(columns, default=-1) >= width):
             raise ConfigError(
@@ -121,6 +123,16 @@ class TrainedConfig(PreTrainedConfig):
                 f"of {OBS_STATE}, below {width}, or -1, for each of the {actions} actions. Make the policy with the "
                 "metadata of its dataset."
             )
+
+    def check_scale(self: Any, *kinds: str) -> None:
+        """Refuse numbers that are given their units back and are not normalised by mean and standard deviation."""
+        for kind in kinds:
+            mode = NormalizationMode(self.normalization_mapping.get(kind, NormalizationMode.IDENTITY))
+            if mode is not NormalizationMode.MEAN_STD:
+                raise ConfigError(
+                    f"policy.normalization_mapping has {mode.value} for {kind}; a {self.type} that computes "
+                    "with numbers in their units knows their mean and standard deviation: set MEAN_STD."
+                )
 
 
 def names_of(features: Mapping[str, Mapping[str, Any]], key: str) -> list[str]:

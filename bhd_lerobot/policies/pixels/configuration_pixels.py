@@ -110,6 +110,8 @@ class PixelsConfig(PerceptionConfig):
                 raise ConfigError(f"bhd_pixels needs {key}, a vector; the dataset has {', '.join(known)}.")
         width = int(known[OBS_STATE].shape[0])
         self.check_columns(width)
+        if self.tool_columns:
+            self.check_scale("STATE")
         self.input_features = {self.image_key: known[self.image_key], OBS_STATE: known[OBS_STATE]}
         self.output_features = {key: known[key] for key in (ACTION, OBS_ENV_STATE) if key in known}
         self.settle()

@@ -64,7 +64,7 @@ class PixelsPolicy(KeepsStatistics, PreTrainedPolicy):
         self.perception.requires_grad_(not config.is_frozen)
         state = int(config.input_features[OBS_STATE].shape[0])  # type: ignore[index]
         columns = [column for column in range(state) if column not in config.ignored_columns]
-        self.register_buffer("_columns", torch.tensor(columns), persistent=False)
+        self.register_buffer("_columns", torch.tensor(columns, dtype=torch.long), persistent=False)
         left, bottom, right, top = config.area
         middle = [(left + right) / 2, (bottom + top) / 2, config.object_height / 2]
         self.register_buffer("_middle", torch.tensor(middle), persistent=False)

@@ -279,6 +279,10 @@ def test_features_that_it_cannot_be_built_for() -> None:
     features = {"input_features": config().input_features, "output_features": config().output_features}
     with pytest.raises(ConfigError, match=r"give policy\.ignored_columns"):
         MlpPolicy(MlpConfig(device="cpu", ignore=["*.vel"], **features))
+    modes = dict.fromkeys(("STATE", "ENV", "ACTION"), NormalizationMode.MIN_MAX)
+    made = config(residual=["x.vel"], residual_columns=[0, -1], normalization_mapping=modes)
+    with pytest.raises(ConfigError, match=r"has MIN_MAX for STATE.*set MEAN_STD"):
+        MlpPolicy(made)
     made = MlpConfig(device="cpu", scan=ScanConfig(transform="inverse"))
     with pytest.raises(ConfigError, match="does not have"):
         made.set_dataset_feature_metadata({OBS_STATE: {"names": ["a", "b"]}})

@@ -137,6 +137,11 @@ def test_it_looks_at_the_first_image_only_and_says_what_it_learned_to_say() -> N
     assert loss["action"] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_it_acts_on_what_it_saw_alone_where_all_of_the_state_is_ignored() -> None:
+    policy, samples = PixelsPolicy(made(ignored_columns=list(range(14)))).eval(), batch(2)
+    assert torch.equal(policy.predict_action_chunk(present(samples)), policy.predict_action_chunk(present(samples, 1)))
+
+
 def test_words_count_and_what_is_ignored_does_not() -> None:
     policy, samples = PixelsPolicy(made()).eval(), present(batch(2))
 
