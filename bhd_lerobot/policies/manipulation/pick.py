@@ -178,7 +178,7 @@ class PickBrain(GoalBrain):
             work.stage = "close"
             command = BrainCommand(self.new_id(sim, "close"), gripper=max(0.0, grasp.width - SQUEEZE))
         elif skill == Skill.LIFT:
-            command = self._line(sim, "lift", grasp, grasp.z + min(config.lift_m, self._handling.lift))
+            command = self._line(sim, "lift", grasp, grasp.z + self._lift)
         elif skill == Skill.HAND_OVER:
             work.stage = "hand_over"
             x, y, z = self._handling.hand_over
@@ -211,6 +211,11 @@ class PickBrain(GoalBrain):
         # Up first, with the fingers open, from wherever the tool is.
         return self._free(sim, "back", work.grasp, opening=self._max_opening)
 
+    @property
+    def _lift(self) -> float:
+        """Height by which it lifts [m]."""
+        return float(min(self.config.lift_m, self._handling.lift))
+
     def _missed(self, sim: int, seen: Observation, target: SeenObject) -> str:
         """Return what is wrong with the grasp, if anything."""
         work = self._work[sim]
@@ -229,7 +234,7 @@ class PickBrain(GoalBrain):
 
     def _is_lifted(self, opening: float, grasp: Grasp, target: SeenObject) -> bool:
         """Return whether the object came up with the gripper, whose fingers are this far apart [m]."""
-        return target.position[2] >= target.size[2] / 2 + _LIFTED
+        return target.position[2] >= target.size[2] / 2 + min(_LIFTED, self._lift / 2)
 
     def _give_up(self, sim: int, problem: str) -> BrainCommand | None:
         self._work[sim].problem = problem

@@ -136,6 +136,16 @@ def test_what_fails_or_slips_out_on_the_way_up_is_tried_again(when: str) -> None
     assert desk.steps()[-1] == "above"
 
 
+def test_what_is_lifted_a_little_as_it_is_to_be_is_lifted() -> None:
+    desk = Desk(PickBrain(PickBrainConfig(lift_m=0.04)), [scene(CUP)])
+    desk.look()
+    grasp(desk)
+    desk.end()
+    desk.lift(0, by=0.04)
+    assert desk.end() is None
+    assert desk.steps() == ["above", "down", "close", "lift"]
+
+
 @each_case("attempts", [1, 2, 5])
 def test_when_every_goal_fails_it_gives_up_in_the_end(attempts: int) -> None:
     desk = Desk(PickBrain(PickBrainConfig(attempts=attempts)), [scene(CUP)])
