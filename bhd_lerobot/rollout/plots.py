@@ -97,6 +97,7 @@ def _grid(count: int) -> tuple[int, int]:
 def draw_panel(axes: Axes, trajectory: Trajectory) -> None:
     """Draw an episode: a line, dashed after a failure, from a circle to a square, or to the cross of a failure."""
     draw_scene(axes, trajectory.scene)
+    _widen(axes, trajectory.xy)
     color, is_failure = _COLOURS[trajectory.success], trajectory.success is False
     style: Any = (0, (3, 1)) if is_failure else "-"
     axes.plot(trajectory.xy[:, 0], trajectory.xy[:, 1], color=color, linestyle=style, linewidth=1.1)
@@ -137,6 +138,8 @@ def draw_table(axes: Axes, scene: TableScene) -> None:
     axes.add_patch(Circle((0.0, 0.0), 0.075, color=_WALL, linewidth=0))
     _draw_objects(axes, scene)
     _frame_axes(axes, (-0.15, 0.85, -0.5, 0.5))
+    target = scene.target_pose or (0.0, 0.0)  # of an arm that is larger than a UR5, it may be farther away
+    _widen(axes, np.array([target[:2], *((item.x, item.y) for item in scene.objects)]))
 
 
 def _draw_objects(axes: Axes, scene: TableScene) -> None:
@@ -167,6 +170,14 @@ def _frame_axes(axes: Axes, limits: tuple[float, float, float, float]) -> None:
     axes.set_yticks([])
     for side in axes.spines.values():
         side.set_visible(False)
+
+
+def _widen(axes: Axes, xy: NDArray[np.float64]) -> None:
+    """Widen what is shown to places [m], shape (k, 2), with a little room around them."""
+    (left, bottom), (right, top) = xy.min(axis=0) - 0.05, xy.max(axis=0) + 0.05
+    (x_min, x_max), (y_min, y_max) = axes.get_xlim(), axes.get_ylim()
+    axes.set_xlim(min(x_min, left), max(x_max, right))
+    axes.set_ylim(min(y_min, bottom), max(y_max, top))
 
 
 def draw_arena(axes: Axes, arena: Arena) -> None:
@@ -211,6 +222,7 @@ def draw_divergence(
     above, differences = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
     left, rows = above.subplots(), differences.subplots(len(curves), 1, squeeze=False)[:, 0]
     draw_scene(left, scene)
+    _widen(left, np.concatenate([recorded, replayed]))
     left.plot(recorded[:, 0], recorded[:, 1], color="#2c3e50", linewidth=3, alpha=0.35, label="recorded")
     left.plot(replayed[:, 0], replayed[:, 1], color=BAD, linewidth=1.1, label="replayed")
     left.plot(*recorded[0], marker="o", color="#2c3e50", markersize=5)

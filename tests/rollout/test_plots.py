@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from bhd_lerobot.bodies.arenas import make_arena
 from bhd_lerobot.bodies.tabletop import TableScene
@@ -32,3 +33,14 @@ def test_an_instruction_about_dollars_is_text(tmp_path):
     one = plots.Trajectory("0", scene, np.array([[0.3, 0.0], [0.4, 0.1]]), None, "put the $5 # note beside the $6 note")
     plots.draw_trajectories([one], tmp_path / "t.png", "one")
     assert (tmp_path / "t.png").is_file()
+
+
+def test_what_a_larger_arm_reaches_is_within_the_panel() -> None:
+    scene = TableScene("reach", (), (), target_pose=(0.87, 0.56, 0.4, 1.0, 0.0, 0.0, 0.0))
+    path = np.array([[0.6, -0.7], [0.95, 0.5]])
+    axes = Figure().subplots()
+    plots.draw_panel(axes, plots.Trajectory("0", scene, path, True))
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    for x, y in (*path, scene.target_pose[:2]):
+        assert left < x < right
+        assert bottom < y < top
