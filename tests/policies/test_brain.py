@@ -1,5 +1,6 @@
 """Brains find their inputs by name, or say at once what is missing."""
 
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,13 +11,14 @@ from numpy.testing import assert_allclose
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.baselines import NoopBrain, NoopConfig
 from bhd_lerobot.policies.blanked import BlankedConfig
-from bhd_lerobot.policies.brain import find_columns, find_scan
+from bhd_lerobot.policies.brain import Brain, find_columns, find_scan
 from bhd_lerobot.policies.dagger.brain import DaggerConfig
 from bhd_lerobot.policies.teleop.takeover import TakeoverBrain
 from bhd_lerobot.recording.driver import open_driver
 from bhd_lerobot.registry import make_brain
 from bhd_lerobot.rollout.marks import Marks
 from tests.cases import each_case
+from tests.docs.support import ROOT
 
 
 def scan_names(beams: int) -> tuple[str, ...]:
@@ -71,3 +73,11 @@ def test_what_drives_a_recording_is_closed_with_all_that_it_is_made_of(monkeypat
     both: Any = TakeoverBrain(make_brain(one), NoopBrain(), lambda: False)  # type: ignore[arg-type]
     both.close()
     assert len(closed) == 2
+
+
+def test_what_the_documents_say_that_a_brain_may_offer_it_may_offer() -> None:
+    text = (ROOT / "docs" / "how_to" / "plugins.md").read_text(encoding="utf-8")
+    table = text.partition("| attribute or method |")[2].partition("\n\n")[0]
+    names = [name for line in table.splitlines() for name in re.findall(r"`(\w+)[`(]", line.partition(" | ")[0])]
+    assert {"needs", "advice"} < set(names)
+    assert [name for name in names if not hasattr(Brain, name)] == []
