@@ -9,9 +9,9 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
-from bhd_lerobot.bodies.tabletop import COLOURS, KINDS, TableObject
+from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
 from bhd_lerobot.errors import ConfigError, InstructionError, unknown_name
 from bhd_lerobot.policies.manipulation.grasp import SeenObject
 
@@ -83,12 +83,6 @@ class SceneObject:
             raise ConfigError(f"position of the {self.name} is {self.position}; it must be three finite numbers.")
         if len(self.size) != 3 or not all(0 < v < math.inf for v in self.size):
             raise ConfigError(f"size of the {self.name} is {self.size}; it must be three numbers > 0.")
-
-    @classmethod
-    def from_table(cls, index: int, thing: TableObject) -> Self:
-        """Return what a planner sees of an object that stands on the table, whose surface is at z = 0."""
-        position = (thing.x, thing.y, thing.height / 2)
-        return cls(index, thing.kind, thing.colour, position, (2 * thing.size_x, 2 * thing.size_y, thing.height))
 
     @property
     def name(self) -> str:

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.bodies.tabletop import TableObject
 from bhd_lerobot.errors import ConfigError, InstructionError
 from bhd_lerobot.policies.manipulation.skills import (
     LAST,
@@ -86,14 +85,6 @@ def test_a_plan_is_about_one_object() -> None:
     ):
         Plan("x", 7, steps)
     Plan("x", 7, tuple(PlanStep(step.skill, None, step.text) for step in steps))
-
-
-def test_an_object_on_the_table_has_its_centre_and_its_edges() -> None:
-    thing = TableObject("box", "green", size_x=0.03, size_y=0.02, height=0.05, x=0.4, y=-0.1)
-    listed = SceneObject.from_table(2, thing)
-    assert (listed.index, listed.kind, listed.colour, listed.name) == (2, "box", "green", thing.name)
-    assert listed.position == (0.4, -0.1, 0.025)
-    assert listed.size == (0.06, 0.04, 0.05)
 
 
 @each_case(
