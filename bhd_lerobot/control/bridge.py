@@ -43,14 +43,14 @@ class Bridge(ABC):
             values: the commands, shape (n, width).
             mask: the simulations it is for, shape (n,); all if None.
             due_ns: when it takes effect [ns]; at the next tick if None.
-            replaces: whether it takes the place of what was sent before and is not due yet.
+            replaces: whether it takes the place of what was sent before and is not due yet; one for now always does.
         """
         cerebellum, now = self.cerebellum, self.now_ns
         due = now if due_ns is None else due_ns
         if abs(due - now) > HORIZON_NS:
             return cerebellum.refuse(Reason.BEYOND_HORIZON if due > now else Reason.STALE, mask)
         sequence = int(cerebellum.fifo.sent_sequence.max()) + 1
-        return cerebellum.offer(Setpoint(sequence, due, values, replaces), mask)
+        return cerebellum.offer(Setpoint(sequence, due, values, replaces or due_ns is None), mask)
 
     def send_chunk(
         self, values: NDArray[np.float64], mask: NDArray[np.bool_] | None = None, start_ns: int | None = None

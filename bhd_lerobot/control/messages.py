@@ -160,7 +160,7 @@ class Setpoint:
         due_ns: when it is to take effect, on the cerebellum's clock [ns].
         values: the command, shape (n, width), in the units of the action features.
         replaces: whether it takes the place of what was sent before and is not due yet: the first of a new action
-            chunk. Otherwise it must not be due before what was sent before.
+            chunk, or one for now. Otherwise it must not be due before what was sent before.
     """
 
     sequence: int

@@ -81,6 +81,18 @@ def test_a_chunk_is_one_command_a_frame() -> None:
     assert chunked.state().mode.tolist() == [Mode.HOLD]
 
 
+@pytest.mark.law
+def test_a_setpoint_takes_the_place_of_what_is_left_of_a_chunk() -> None:
+    """A person takes over from a policy that has sent what it wants to do in the coming second."""
+    bridge = perfect()
+    assert all(result.accepted.all() for result in bridge.send_chunk(np.tile(twist(0.2, 0.5), (10, 1, 1))))
+    bridge.advance_frame()
+    for _ in range(6):
+        assert bridge.send(twist(0.0, 0.0)).accepted.all()
+        bridge.advance_frame()
+    assert not bridge.cerebellum.plant.written.any()
+
+
 @pytest.mark.parametrize("rates", [Rates(200, 200, 10), Rates(1000, 200, 10)], ids=str)
 def test_an_emergency_stop_brings_bases_to_rest_within_300_ms(rates: Rates) -> None:
     commands = np.array([(0.22, 0.0), (-0.22, 0.0), (0.0, 2.84), (0.0, -2.84), (0.12, 1.2)])
