@@ -306,8 +306,6 @@ def follow_controller(state: Any, limits: Any) -> None:
     if state.protective_stop:
         state.watchdog |= state.protective_stop  # whatever moved it there would keep pressing
         fail(state, state.protective_stop)
-    if state.busy == state.by_goal:
-        return
     resumes = state.follows_goal and state.mode == _STOPPING and not state.is_deactivating
     if resumes or (state.busy and state.mode == _HOLD):
         state.by_goal = True

@@ -178,6 +178,26 @@ def test_a_setpoint_of_one_arm_does_not_end_the_goal_of_another() -> None:
 
 
 @pytest.mark.law
+def test_a_goal_that_comes_while_the_arm_still_brakes_after_one_is_stopped_like_any_other() -> None:
+    """A brain that falls silent twice: the second silence stops what it sent after the first."""
+    rig = Rig()
+    rig.go(**SWEEP)
+    rig.tick(150)
+    rig.cerebellum.interrupt(Watchdog.BRAIN, Mode.STOPPING)
+    rig.tick(5)
+    assert rig.mode == Mode.STOPPING
+    assert rig.go(joint_target=posture(j0=-0.8), gripper=0.0) is None
+    rig.tick(400)
+    assert np.abs(rig.plant.velocity).max() > 0.5
+    rig.cerebellum.interrupt(Watchdog.BRAIN, Mode.STOPPING)
+    rig.tick(HZ)
+    assert not np.diff(rig.plant.written[-100:], axis=0).any()
+    assert rig.mode == Mode.HOLD
+    assert rig.results() == [("1", ResultCode.CANCELLED), ("2", ResultCode.CANCELLED)]
+    rig.check()
+
+
+@pytest.mark.law
 def test_an_emergency_stop_ends_a_goal_and_latches() -> None:
     rig = Rig()
     rig.go(**SWEEP)
