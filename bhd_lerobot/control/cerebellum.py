@@ -319,7 +319,7 @@ class Cerebellum:
         wanted = np.zeros(self.n, np.bool_)
         wanted[slice(None) if ids is None else ids] = True
         if request == Request.CONFIGURE:
-            self._read_anew(wanted)
+            self._read_anew(wanted & (self.mode == Mode.UNCONFIGURED))
         sources, result = _TRANSITIONS[request]
         applies = wanted & np.isin(self.mode, [int(source) for source in sources])
         allowed = applies.copy()
@@ -328,7 +328,7 @@ class Cerebellum:
         reasons[wanted & ~allowed & (self.mode == Mode.FAULT)] = Reason.FAULT
         if request == Request.RESET:
             # A stop that is not over yet must not become a gentler one.
-            moving = allowed & ~self.controller.at_rest()
+            moving = allowed & self.states["is_configured"] & ~self.controller.at_rest()
             reasons[moving] = Reason.NOT_AT_REST
             allowed &= ~moving
         if request in (Request.RESET, Request.ACTIVATE):
@@ -378,6 +378,8 @@ class Cerebellum:
             self.states[name][others] = values  # theirs are of the last tick
         self.readings.forget(np.flatnonzero(mask))
         judge_all.run(self.states, self.numbers, mask)
+        outside = self.readings.refuse_outside(np.flatnonzero(mask))
+        self._set_mode(np.isin(np.arange(self.n), outside) & (self.mode < Mode.ESTOP), Mode.FAULT)
         self._tell_controller()
 
     def restart(self, ids: NDArray[np.intp]) -> None:

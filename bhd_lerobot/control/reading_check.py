@@ -23,10 +23,11 @@ _FROZEN_S = 0.02  # a reading that is the same for so long
 LARGEST = 1e9  # [rad, rad/s] nothing turns as far, or as fast
 _FARTHEST_NS = 1 << 61  # of a stamp from 0: differences of such stamps are numbers of 64 bits
 _FROZEN_SHARE = 0.01  # while the torque changed by more than this share of the largest does not measure
+_MOST_OUTSIDE = 0.1  # [rad] a joint may be found so far out of its range: the first command brings it back
 
 
 _HOLD, _STOPPING = int(Mode.HOLD), int(Mode.STOPPING)
-_TOO_FAR, _CONTRADICTS, _FROZEN, _AHEAD = 1, 2, 3, 4  # what `problem` of a record says
+_TOO_FAR, _CONTRADICTS, _FROZEN, _AHEAD, _OUTSIDE = 1, 2, 3, 4, 5  # what `problem` of a record says
 
 
 @kernel()
@@ -127,10 +128,13 @@ class ReadingCheck:
         self._names, self._states, self._limits = body.joints, states, limits[0]
         limits["oldest_ns"], limits["ahead_ns"], limits["period_s"] = _SLACK_PERIODS * period, period, 1.0 / control_hz
         limits["joints"] = len(body.joints)
+        self._range = np.zeros((2, 0))  # of joints that are commanded positions [rad]
         speeds: list[float] = []
         if body.arm is not None:
             dof = len(body.arm.chain.joints)
             speeds += [*body.arm.limits.velocity[:dof], *([np.inf] if body.arm.gripper else [])]
+            if body.arm.actuation == "position":
+                self._range = np.array([body.arm.limits.lower[:dof], body.arm.limits.upper[:dof]])
             if body.arm.actuation == "torque":
                 limits["is_torque"], limits["frozen_ticks"] = True, round(_FROZEN_S * control_hz)
                 put(limits[0], "least_torque", _FROZEN_SHARE * np.asarray(body.arm.limits.effort[:dof]))
@@ -149,6 +153,18 @@ class ReadingCheck:
             self._states[name][ids] = np.nan
         for name in ("same_ticks", "off", "way", "problem", "silence_ns"):
             self._states[name][ids] = 0
+
+    def refuse_outside(self, ids: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the robots of which a joint is found far out of its range: the first command would be a jump."""
+        low, high = self._range
+        found = self._states["position"][ids, : len(low)]
+        beyond = np.maximum(low - found, found - high)
+        rows = np.flatnonzero((beyond > _MOST_OUTSIDE).any(axis=1))
+        for row in rows.tolist():
+            state, joint = self._states[ids[row]], int(beyond[row].argmax())
+            state["near"] = np.nan  # it is not known from where to go on
+            state["problem"], state["problem_joint"], state["problem_value"] = _OUTSIDE, joint, found[row, joint]
+        return ids[rows]
 
     @property
     def problem(self) -> str:
@@ -179,6 +195,12 @@ class ReadingCheck:
                 return (
                     f"{name} reads the same for {_FROZEN_S:g} s while its torque changes: no measurement. Check its "
                     "encoder"
+                )
+            case 5:
+                low, high = self._range[:, state["problem_joint"]]
+                return (
+                    f"{name} is found at {way:.3f} rad, and its limits are {low:.3f} and {high:.3f}: the first command "
+                    "would be a jump. Move it between them by hand, or check the zero of its encoder"
                 )
         text = f"{name} reads a change of {way:.3f} rad within {elapsed_ns / 1e6:.1f} ms"
         turns = round(way / _TURN)

@@ -465,3 +465,23 @@ def test_a_sequence_number_that_no_sender_reaches_is_refused_and_the_next_comman
     assert rig.cerebellum.restart(np.array([0])) is None  # a sender counts on, and may have come far
     assert [rig.request(one).accepted.all() for one in (Request.CONFIGURE, Request.ACTIVATE)] == [True, True]
     assert rig.send(0.1, sequence=10**9).accepted.all()
+
+
+@pytest.mark.law
+def test_an_arm_that_is_found_far_out_of_its_range_gets_no_command_before_it_was_moved_into_it() -> None:
+    """The first command is where it is; where it may not be commanded to be, that would be a jump."""
+    rig = arm_rig.Rig(active=False)
+    rig.plant.position[0, 2] = ARM.limits.upper[2] + 0.3
+    for request in (Request.CONFIGURE, Request.RESET):
+        assert rig.request(request).reasons.tolist() == [Reason.FAULT]
+        rig.tick(50)
+    assert rig.mode == Mode.FAULT
+    assert not rig.plant.written
+    assert "elbow is found at 6.583 rad" in rig.cerebellum.readings.problem
+    rig.plant.position[0, 2] = ARM.limits.upper[2] - 0.01
+    where = rig.plant.position.copy()
+    for request in (Request.RESET, Request.ACTIVATE):
+        assert rig.request(request).accepted.all()
+    rig.tick(5)
+    assert rig.mode == Mode.HOLD
+    np.testing.assert_array_equal(rig.plant.written, [where] * 5)
