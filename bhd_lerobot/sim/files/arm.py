@@ -1,7 +1,8 @@
 """The body of an arm, from an MJCF or URDF that somebody else wrote.
 
 Of a scene the robot alone is taken, and put onto our table: its base above the origin, turned by a multiple of 90
-degrees so that it works along x. Floor, lights, sensors, keyframes and physics options of the file are left out.
+degrees so that it works along x. Floor, lights, sensors, keyframes and physics options of the file are left out, and so
+are springs of the arm's joints and contact margins: its servos carry the arm, within the torque that they have.
 Position servos keep the gains of the file, and the damping of a joint counts as its servo's; other joints get a servo
 whose natural frequency is `_STIFF` and whose damping is critical.
 """
@@ -121,7 +122,16 @@ class _Arm(RobotFile):
         }
         own = {model.geom(g).name for g in range(model.ngeom) if self._root(model.geom_bodyid[g]) == root}
         strange = [pair for pair in spec.pairs if not {pair.geomname1, pair.geomname2} <= own]
-        for kind in (spec.keys, spec.sensors, spec.lights, spec.actuators, strange):
+        others = {model.joint(one).name for one in range(model.njnt)} - kept
+        tendons = [
+            one
+            for number, one in enumerate(spec.tendons)
+            if others & {model.joint(joint).name for joint in self._wrapped(number)}
+        ]
+        others |= {one.name for one in tendons}
+        coupled = (mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_TENDON)
+        equalities = [one for one in spec.equalities if one.type in coupled and others & {one.name1, one.name2}]
+        for kind in (spec.keys, spec.sensors, spec.lights, spec.actuators, strange, equalities, tendons):
             for one in list(kind):
                 spec.delete(one)
         for joint in list(spec.joints):
@@ -131,7 +141,11 @@ class _Arm(RobotFile):
                 number = self.names.index(joint.name)
                 # In the unit of its own file, which may be attached to another one.
                 unit = np.pi / 180 if getattr(joint, "compiler", spec.compiler).degree else 1.0
-                joint.damping = 0.0 if np.isscalar(joint.damping) else [0.0] * len(joint.damping)
+                for kind in ("damping", "stiffness", "springdamper"):
+                    value = getattr(joint, kind)
+                    setattr(joint, kind, 0.0 if np.isscalar(value) else [0.0] * len(value))
+                effort = self.servos[number].effort
+                joint.actfrcrange, joint.actfrclimited = [-effort, effort], True
                 if self.file.servos:
                     joint.frictionloss = self.servos[number].friction
                 joint.range, joint.limited = [self.lower[number] / unit, self.upper[number] / unit], True
@@ -165,6 +179,7 @@ class _Arm(RobotFile):
         seen = {geom.parent.name for geom in self.spec.geoms if not (geom.contype or geom.conaffinity)}
         for geom in self.spec.geoms:
             geom.group = 1
+            geom.margin = geom.gap = 0.0  # what is near is no contact
             if geom.contype or geom.conaffinity:
                 geom.contype, geom.conaffinity = ARM_BIT, ARM_BIT | TABLE_BIT
                 geom.group = 3 if geom.parent.name in seen else 1

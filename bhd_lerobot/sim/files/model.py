@@ -13,6 +13,11 @@ from bhd_lerobot.sim.engine import mujoco
 
 Array = NDArray[np.float64]
 
+_CLASS = "robot_of_the_file"
+_WITH_CLASS = (
+    *("mesh", "material", "texture", "pair", "connect", "weld", "joint", "tendon", "flex", "fixed", "spatial"),
+)
+
 
 def load_model(path: str) -> Any:
     """Return the specification of a file, with the full paths of its meshes."""
@@ -34,15 +39,17 @@ def load_model(path: str) -> Any:
 def _urdf(path: str) -> str:
     """Return a URDF for MuJoCo: with the full paths of its meshes, and with all its links."""
     text, folder = Path(path).read_text(encoding="utf-8"), Path(path).parent
+    own = re.search(r"<mujoco\b.*?</mujoco>", text, re.DOTALL)
+    folders = ("", *re.findall(r'\bmeshdir="([^"]*)"', own[0] if own else ""))
 
     def full(found: re.Match[str]) -> str:
         name = re.sub(r"^(package|model)://", "", found[1].removeprefix("file://"))
         places = [folder / name, *(above / name for above in folder.parents)]
         places += [above / name.partition("/")[2] for above in (folder, *folder.parents)]
+        places += [folder / where / one for where in folders for one in (name, Path(name).name)]
         return f'filename="{next((one for one in places if one.is_file()), name)}"'
 
     text = re.sub(r'filename="([^"]+)"', full, text)
-    own = re.search(r"<mujoco>.*?</mujoco>", text, re.DOTALL)
     how = '<mujoco><compiler strippath="false" discardvisual="true" fusestatic="false" balanceinertia="true"/></mujoco>'
     return text.replace(own[0], how) if own else re.sub(r"(<robot\b[^>]*>)", rf"\1{how}", text, count=1)
 
@@ -60,7 +67,7 @@ def joint_speeds(path: str) -> dict[str, float]:
 
 
 def robot_alone(text: str, where: Array) -> str:
-    """Return an MJCF with nothing but the robot, moved by a transform."""
+    """Return an MJCF with nothing but the robot, moved by a transform; its defaults are those of the robot alone."""
     tree = ElementTree.fromstring(text)
     for name in ("option", "visual", "statistic", "size", "custom"):
         for one in tree.findall(name):
@@ -75,6 +82,20 @@ def robot_alone(text: str, where: Array) -> str:
         world.remove(one)
         frame.append(one)
     world.append(frame)
+    for main in tree.findall("default"):
+        own = ElementTree.Element("default", {"class": _CLASS})
+        own.extend(list(main))
+        main.clear()
+        main.append(own)
+        for one in tree.iter():
+            for name in ("class", "childclass"):
+                if one.get(name) == "main":
+                    one.set(name, _CLASS)
+        for section in ("asset", "contact", "equality", "tendon"):
+            for one in tree.iterfind(f"{section}/*"):
+                if one.tag in _WITH_CLASS:
+                    one.set("class", one.get("class", _CLASS))
+        frame.set("childclass", _CLASS)
     return ElementTree.tostring(tree, encoding="unicode")
 
 

@@ -21,7 +21,7 @@ from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.sim.files.arm import arm_body
-from bhd_lerobot.sim.files.model import joint_speeds
+from bhd_lerobot.sim.files.model import joint_speeds, load_model
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World
@@ -188,6 +188,41 @@ def test_a_file_with_parts_that_are_not_the_arms_is_simulated_as_the_same_arm(te
     world.check()
 
 
+OTHER = (
+    '<body name="other" pos="0 1 0"><joint name="one" axis="0 0 1" range="-1 1"/><geom type="sphere" size="0.1"/>'
+    '<body name="more" pos="0 0 0.2"><joint name="two" axis="0 0 1" range="-1 1"/><geom type="sphere" size="0.1"/>'
+    '</body></body></worldbody><equality><joint joint1="one" joint2="two"/><tendon tendon1="both"/></equality>'
+    '<tendon><fixed name="both"><joint joint="one" coef="1"/><joint joint="two" coef="1"/></fixed></tendon>'
+)
+
+
+def test_of_two_arms_in_a_file_what_couples_joints_of_the_other_is_left_out(tmp_path: Path) -> None:
+    text = TEXT.replace("</worldbody>", OTHER)
+    model = World(arm_body(written(tmp_path, text, tool="gripper_frame"))).model
+    assert (model.neq, model.ntendon) == (0, 0)
+
+
+@each_case(
+    "default",
+    [
+        ('<position kp="17.8"', '<position kp="17.8" ctrlrange="-0.1 0.1"'),
+        ('<position kp="17.8" forcerange="-2.94 2.94"/>', '<position kp="4.45" forcerange="-1.47 1.47" gear="2"/>'),
+        ('<geom condim="3"', '<geom condim="3" priority="2" solref="0.1 1"'),
+    ],
+)
+def test_defaults_of_a_file_are_those_of_its_robot_alone(default: tuple[str, str], tmp_path: Path) -> None:
+    plain, other = (
+        World(arm_body(written(tmp_path, text, f"{number}.xml"))).model
+        for number, text in enumerate((TEXT, TEXT.replace(*default)))
+    )
+    for name in ("gear", "ctrllimited", "gainprm", "biasprm"):
+        values = getattr(other, f"actuator_{name}"), getattr(plain, f"actuator_{name}")
+        np.testing.assert_allclose(*values, rtol=1e-9)
+    for name in ("table", "object_0"):
+        ours, usual = other.geom(name), plain.geom(name)
+        assert (ours.priority, *ours.solref, *ours.friction) == (usual.priority, *usual.solref, *usual.friction)
+
+
 @each_case(
     ("there", "named"),
     [
@@ -211,6 +246,60 @@ def test_speeds_of_a_urdf_are_those_of_its_limits(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert joint_speeds(str(path)) == {"one": 2.175}
+
+
+@each_case("compiler", ["", '<mujoco><compiler meshdir="shapes" balanceinertia="true"/></mujoco>'])
+def test_meshes_of_a_urdf_are_found_where_mujoco_looks_for_them(compiler: str, tmp_path: Path) -> None:
+    folder, path = tmp_path / ("shapes" if compiler else "."), tmp_path / "arm.urdf"
+    folder.mkdir(exist_ok=True)
+    (folder / "link.obj").write_text(LINK, encoding="utf-8")
+    mesh = '<geometry><mesh filename="package://my_arm/meshes/link.obj"/></geometry>'
+    path.write_text(
+        f'<robot name="arm">{compiler}<link name="base"><collision>{mesh}</collision></link></robot>', encoding="utf-8"
+    )
+    assert load_model(str(path)).compile().nmesh == 1
+
+
+@each_case(
+    ("text", "effort"),
+    [
+        (TEXT, ()),
+        (TEXT.replace('frictionloss="0.052"', 'frictionloss="0.052" actuatorfrcrange="-1 1"'), (2.94,)),
+    ],
+)
+def test_motors_give_the_torque_that_is_said_of_them_and_carry_the_arm_with_it(
+    text: str, effort: tuple[float, ...], tmp_path: Path
+) -> None:
+    body = arm_body(written(tmp_path, text, effort=effort))
+    world, joints = World(body), body.need(Arm).chain.joints
+    torque, dofs = world.derived("qfrc_actuator"), world.joint_slice(joints)[1]
+    for way in (-1.0, 1.0):
+        world.reset()
+        world.ctrl[0, : len(joints)] += way
+        world.step()
+        assert np.abs(torque[0, dofs]).max() == pytest.approx(2.94)
+
+
+@each_case(
+    "text",
+    [
+        TEXT,
+        TEXT.replace('damping="0.6"', 'damping="0.6" stiffness="6" springref="0.8"'),
+        TEXT.replace('<geom condim="3"', '<geom condim="3" margin="0.05"'),
+    ],
+)
+def test_neither_springs_nor_margins_move_an_arm_that_is_held_over_the_table(text: str, tmp_path: Path) -> None:
+    body = arm_body(written(tmp_path, text))
+    arm, pose = body.need(Arm), np.diag((1.0, -1.0, -1.0, 1.0))
+    pose[:3, 3] = np.mean(arm.workspace.table, axis=0)[0], 0.0, arm.workspace.handling.lowest
+    posture = ArmKinematics(arm.chain, arm.limits).solve(pose, np.array(arm.home[:-1])).postures[0]
+    world = World(body)
+    table = Tabletop(world)
+    table.place([TableScene("low", (), (*posture, arm.home[-1]))])
+    for _ in range(500):
+        world.step()
+    np.testing.assert_allclose(world.qpos[0, world.joint_slice(arm.chain.joints)[0]], posture, atol=2e-3)
+    assert not table.arm_on_table.any()
 
 
 @each_case(
