@@ -1,5 +1,6 @@
 """The geometry of arms that are read from models, beside the engine that simulates these."""
 
+from dataclasses import replace
 from itertools import product
 
 import mujoco
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Arm, Placement
 from bhd_lerobot.bodies.ur import MODELS, ur
+from bhd_lerobot.control.geometry.capsules import left_out
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.record import SHAPES
@@ -254,3 +256,16 @@ def test_no_link_is_taken_for_an_obstacle_or_for_what_is_held() -> None:
 def test_a_home_of_joints_that_are_not_there_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"'joint_9'"):
         chain_from_mjcf(ARM, "tool", home={"joint_9": 0.0})
+
+
+@pytest.mark.law
+@pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 0), (7, 2)])
+def test_shapes_whose_distance_is_not_checked_do_not_meet(joints: int, seed: int) -> None:
+    model = mujoco.MjModel.from_xml_string(serial(joints, seed))
+    chain, (lower, upper) = chain_from_mjcf(model, "tool"), model.jnt_range[:joints].T
+    pairs = left_out(chain)
+    unchecked, rng = CollisionModel(replace(chain, disjoint=pairs)), np.random.default_rng(1)
+    apart = unchecked.each(np.zeros((1, joints)))[: len(pairs), 0] >= chain.min_distance  # at home
+    for _ in range(200):
+        distances = unchecked.each(rng.uniform(lower, upper, (500, joints)))[: len(pairs)]
+        assert (distances[apart] > 0.0).all()

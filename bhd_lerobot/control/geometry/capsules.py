@@ -18,6 +18,7 @@ _CUTS = np.linspace(0.2, 0.8, 7)  # where along it
 _SMALLER = 0.9  # of the volume: two capsules in place of one
 _COVER = 1.0 + 1e-9
 _POSTURES, _BATCH = 2000, 100
+_AROUND, _DRAWS = np.geomspace(0.4, 0.005, 15), 8  # of the ranges: so far, and so often, around the nearest of these
 _NEVER = 0.02  # [m] capsules that stay so far apart in all of these postures do not meet
 _ALWAYS = 0.95  # share of the postures; capsules that are too near in more say nothing about a posture
 
@@ -115,7 +116,8 @@ def with_pairs(chain: ArmChain, home: Array, lower: Array, upper: Array) -> ArmC
     """Return a chain with the pairs of capsules that may meet.
 
     Pairs are left out that are on one link or on adjacent ones, that are too near at home, and those that are never
-    near, or nearly always too near, in 2,000 random postures: the same each time.
+    near, or nearly always too near, in 2,000 random postures, and never near around those in which they are nearest:
+    the same each time.
 
     Args:
         chain: its own pairs are not looked at.
@@ -132,11 +134,24 @@ def with_pairs(chain: ArmChain, home: Array, lower: Array, upper: Array) -> ArmC
     )
     model = CollisionModel(replace(chain, disjoint=pairs))
     nearest, near = np.full(len(pairs), np.inf), np.zeros(len(pairs))
-    postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, chain.dof))
-    for batch in np.split(postures, _POSTURES // _BATCH):
-        distances = model.each(batch)[: len(pairs)]
-        nearest = np.minimum(nearest, distances.min(axis=1))
-        near += (distances < chain.min_distance).sum(axis=1)
+    at, rng = np.zeros((len(pairs), chain.dof)), np.random.default_rng(0)
+
+    def look(postures: Array) -> Array:
+        """Note where pairs are nearest; return in how many of the postures each is too near."""
+        distances = model.each(postures)[: len(pairs)]
+        closest = distances.argmin(axis=1)
+        found = distances[np.arange(len(pairs)), closest]
+        better = found < nearest
+        nearest[better], at[better] = found[better], postures[closest[better]]
+        return np.asarray((distances < chain.min_distance).sum(axis=1))
+
+    for batch in np.split(rng.uniform(lower, upper, (_POSTURES, chain.dof)), _POSTURES // _BATCH):
+        near += look(batch)
+    for share in _AROUND:
+        around = np.repeat(at[nearest >= _NEVER], _DRAWS, axis=0)
+        around = np.clip(around + share * (upper - lower) * rng.normal(size=around.shape), lower, upper)
+        for batch in np.array_split(around, len(around) // _BATCH + 1) if len(around) else ():
+            look(batch)
     at_home = model.each(home[None])[: len(pairs), 0]
     may = (at_home >= chain.min_distance) & (nearest < _NEVER) & (near < _ALWAYS * _POSTURES)
     return replace(chain, disjoint=tuple(pair for pair, one in zip(pairs, may, strict=True) if one))
