@@ -128,7 +128,7 @@ class ReadingCheck:
         self._names, self._states, self._limits = body.joints, states, limits[0]
         limits["oldest_ns"], limits["ahead_ns"], limits["period_s"] = _SLACK_PERIODS * period, period, 1.0 / control_hz
         limits["joints"] = len(body.joints)
-        self._range = np.zeros((2, 0))  # of joints that are commanded positions [rad]
+        self._range: NDArray[np.float64] = np.zeros((2, 0))  # of joints that are commanded positions [rad]
         speeds: list[float] = []
         if body.arm is not None:
             dof = len(body.arm.chain.joints)
