@@ -200,7 +200,7 @@ class ReadingCheck:
                 low, high = self._range[:, state["problem_joint"]]
                 return (
                     f"{name} is found at {way:.3f} rad, and its limits are {low:.3f} and {high:.3f}: the first command "
-                    "would be a jump. Move it between them by hand, or check the zero of its encoder"
+                    "would be a jump. Move it between them by hand, or calibrate its zero again"
                 )
         text = f"{name} reads a change of {way:.3f} rad within {elapsed_ns / 1e6:.1f} ms"
         turns = round(way / _TURN)

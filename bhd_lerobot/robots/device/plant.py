@@ -24,7 +24,6 @@ from bhd_lerobot.robots.device.units import Unit, unit_of
 _START_S, _END_S = 90.0, 5.0  # that the device's process may take to import and connect, and to disconnect
 _SLOTS, _TEXT = 4, 400
 _LATENCY_S = 0.05  # of a serial bus with its servos
-_OUTSIDE = 0.1  # [rad] a joint may be so far beyond its limits where it is found: the first command brings it back
 _MOST_SAG = 0.1  # [rad] that commands are raised by at the most, to carry the arm's weight
 
 
@@ -152,18 +151,7 @@ class DevicePlant(Plant):
                 )
 
     def enable(self) -> None:
-        """Let commands through from now on.
-
-        Raises:
-            RealtimeError: a joint is found where no command may bring it.
-        """
-        limits, where = self._arm.limits, self._newest()["position"] * self._scale + self._offset
-        for k in range(self._dof):
-            if not limits.lower[k] - _OUTSIDE <= where[k] <= limits.upper[k] + _OUTSIDE:
-                raise RealtimeError(
-                    f"{self._names[k]} reads {where[k]:.3f} rad, and its limits are {limits.lower[k]:.3f} and "
-                    f"{limits.upper[k]:.3f}: move it between them by hand, or calibrate it again (lerobot-calibrate)"
-                )
+        """Let commands through from now on."""
         self._enabled = True
 
     def _newest(self) -> Any:

@@ -309,7 +309,7 @@ class Host:
         setpoints, refused = self.to_setpoints(action, mask, None)
         if refused:
             mask[list(refused)] = False
-        receipt.sent = self.bridge.send(setpoints, mask, replaces=True)  # what is left of a chunk
+        receipt.sent = self.bridge.send(setpoints, mask)
         receipt.refuse(refused)
 
     def _send_chunk(self, actions: NDArray[np.float64], start_ns: int | None, receipt: Acceptance) -> None:
