@@ -82,7 +82,7 @@ ARROWS: dict[str, tuple[str, ...]] = {
     "datasets.remote": (*_DATASETS, "datasets.assembly"),
     "datasets.loader": (*_DATASETS, "datasets.remote", "tasks"),
     "datasets.timing": ("realtime", *_DATASETS, "control"),
-    "ros2.messages": ("bodies", "control", "control.geometry", "datasets.format"),
+    "ros2.messages": ("options.unique_keys", "bodies", "control", "control.geometry", "datasets.format"),
     "ros2.live": ("programs", "bodies", "control", "ros2.messages"),
     "ros2.robots": ("bodies", "control", "ros2.live", "ros2.messages"),
     "ros2.serve": (

@@ -10,5 +10,6 @@ __all__ = [
     "registry",
     "shipped",
     "terminal",
+    "unique_keys",
     "units",
 ]

@@ -23,32 +23,11 @@ from bhd_lerobot.errors import BhdError, ConfigError, unknown_name
 from bhd_lerobot.options.declared import check_option, declared_types
 from bhd_lerobot.options.plugins import load_lerobot, names_of_lerobot
 from bhd_lerobot.options.shipped import found_config
+from bhd_lerobot.options.unique_keys import UniqueKeys
 
 CONFIG_PATH = "config_path"
 RUN_CONFIG = "config.yaml"
 """What the configuration of a run is called in its folder."""
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads a date as text, and refuses a key that a mapping has twice, of which YAML would take the last."""
-
-    def flatten_mapping(self, node: Any) -> None:
-        """Check the keys as they are written; what `<<` merges into them afterwards gives way to them."""
-        if not hasattr(node, "has_own_keys"):
-            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-            for key in (key for key in keys if keys.count(key) > 1):
-                place = f"line {node.start_mark.line + 1}"
-                raise yaml.YAMLError(
-                    f"the key {key!r} occurs twice in the mapping that begins in {place}; leave one of them"
-                )
-            node.has_own_keys = True
-        super().flatten_mapping(node)
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in kinds if tag != "tag:yaml.org,2002:timestamp"]
-    for first, kinds in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -124,7 +103,7 @@ def read_line(arguments: Sequence[str] | CommandLine, command: str = "") -> Comm
         if key in options:
             raise ConfigError(f"Option --{key} was given twice.")
         try:
-            options[key] = text if key == CONFIG_PATH else yaml.load(text, _Loader)
+            options[key] = text if key == CONFIG_PATH else yaml.load(text, UniqueKeys)
         except (yaml.YAMLError, ValueError) as error:
             raise ConfigError(f"The value of --{key}, {text!r}, cannot be read: {error}") from error
     text = options.pop(CONFIG_PATH, None)
@@ -182,7 +161,7 @@ def read_file(path: Path) -> dict[str, Any]:
     is_json = path.suffix == ".json"  # JSON's 1e-05 is text in YAML
     try:
         text = path.read_text(encoding="utf-8")
-        values = json.loads(text, object_pairs_hook=_unique) if is_json else yaml.load(text, _Loader)
+        values = json.loads(text, object_pairs_hook=_unique) if is_json else yaml.load(text, UniqueKeys)
     except OSError as error:
         raise ConfigError(
             f"The configuration {str(path)!r} cannot be read: {error.strerror}. Give --config_path a YAML or JSON file."

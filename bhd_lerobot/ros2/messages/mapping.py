@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import LidarSpec
 from bhd_lerobot.errors import ConfigError, DatasetError, as_text, unknown_name
+from bhd_lerobot.options.unique_keys import UniqueKeys
 from bhd_lerobot.ros2.messages.base import unwrapped, yaw_of
 from bhd_lerobot.ros2.messages.definitions import register_types
 from bhd_lerobot.ros2.messages.fields import Field, elements_of
@@ -108,13 +109,12 @@ class MappingConfig:
             ConfigError: it cannot be read, or has other keys.
         """
         try:
-            tree = yaml.safe_load(Path(path).expanduser().read_text("utf-8"))
+            tree = yaml.load(Path(path).expanduser().read_text("utf-8"), UniqueKeys)
         except OSError as error:
             raise ConfigError(f"The mapping {path} cannot be read: {error.strerror}.") from error
         except (UnicodeDecodeError, yaml.YAMLError) as error:
-            raise ConfigError(
-                f"The mapping {path} cannot be read: {as_text(error)}. In YAML a value with [ in it needs quotes."
-            ) from error
+            hint = " In YAML a value with [ in it needs quotes." * isinstance(error, yaml.MarkedYAMLError)
+            raise ConfigError(f"The mapping {path} cannot be read: {as_text(error)}.{hint}") from error
         return cls.of(tree, str(path))
 
     @classmethod

@@ -104,6 +104,14 @@ def test_a_file_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert load.read(decode(load.msgtype, load.encode(np.array([3.0]), 0))) == [3.0]
 
 
+def test_a_key_that_is_there_twice_is_named(tmp_path: Path) -> None:
+    """YAML would take the last: an action of which another field moves than the one that was read first."""
+    entry = "{topic: /odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}"
+    (tmp_path / "robot.yaml").write_text(f"observation:\n  x.vel: {entry}\n  x.vel: {entry}\n")
+    with pytest.raises(ConfigError, match="'x.vel' occurs twice .* line 2; leave one of them"):
+        MappingConfig.load(tmp_path / "robot.yaml")
+
+
 @each_case(
     ("wrong", "text"),
     [
