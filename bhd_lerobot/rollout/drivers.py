@@ -1,6 +1,6 @@
 """Who drives in each frame: the brain or an intervening expert."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,20 +23,19 @@ class Intervention:
 class DriverLog:
     """Who drives n simulations, from one decision of a brain to the next."""
 
-    def __init__(self, brain: Brain, n: int, frames: int) -> None:
+    def __init__(self, brain: Brain, n: int) -> None:
         self._brain = brain
         self._intervenes = False
-        self._taken = np.zeros((n, frames), np.bool_)
         self._now, self._before = np.zeros((2, n), np.bool_)
         self._fresh = np.ones(n, np.bool_)
-        self._causes: list[dict[int, str]] = [{} for _ in range(n)]
+        self._found: list[list[Intervention]] = [[] for _ in range(n)]
         self._why, self._why_before = [""] * n, [""] * n
 
     def start(self, ids: NDArray[np.intp]) -> None:
         """Start episodes in some simulations."""
         self._fresh[ids] = True
         for sim in ids.tolist():
-            self._causes[sim] = {}
+            self._found[sim] = []
 
     def decided(self) -> None:
         """Note who drives by the decision that the brain has just made."""
@@ -62,29 +61,25 @@ class DriverLog:
             is_missed: whether the frame went by during inference: the decision before was still in force.
         """
         taken = self._before if is_missed else self._now
-        rows = length[running]
-        self._taken[running, rows] = taken[running]
         if np.count_nonzero(taken[running]):
             causes = self._why_before if is_missed else self._why
-            for sim, row in zip(running.tolist(), rows.tolist(), strict=True):
+            for sim, row in zip(running.tolist(), length[running].tolist(), strict=True):
                 if taken[sim]:
-                    self._causes[sim][row] = causes[sim]
+                    self._add(self._found[sim], row, causes[sim])
         return taken
 
-    def interventions(self, sim: int, length: int) -> list[Intervention] | None:
+    @staticmethod
+    def _add(found: list[Intervention], row: int, cause: str) -> None:
+        if found and found[-1].end == row:
+            found[-1] = replace(found[-1], end=row + 1)
+        else:
+            found.append(Intervention(row, row + 1, cause))
+
+    def interventions(self, sim: int) -> list[Intervention] | None:
         """Return the interventions of an episode that has ended; None if the brain has no interventions."""
-        if not self._intervenes:
-            return None
-        causes = self._causes[sim]
-        return [Intervention(first, end, causes[first]) for first, end in spans(self._taken[sim, :length])]
+        return self._found[sim] if self._intervenes else None
 
 
 def flagged(event: NDArray[np.int64], taken: Mask) -> NDArray[np.int64]:
     """Return the events of a frame with the interventions among them: what ends an episode takes precedence."""
     return np.where(taken & (event == Event.NOTHING), int(Event.INTERVENTION), event)
-
-
-def spans(mask: Mask) -> list[tuple[int, int]]:
-    """Return where a mask of shape (frames,) is true, as first frames and those after the last."""
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]

@@ -28,6 +28,7 @@ from bhd_lerobot.tasks.task import Event, Task, outcomes_of
 
 # The brain's random numbers must not be the sensors': two streams of one episode's seed.
 _BRAIN_STREAM = 2
+_FIRST_FRAMES = 4096  # that there is room for at once: an episode may last much longer than it does
 
 
 def track_of(robots: Robots, columns: Mapping[str, NDArray]) -> NDArray[np.float64]:
@@ -88,13 +89,12 @@ class EpisodeLoop:
         self._order: list[int] = []  # numbers of the episodes in the order in which they are yielded
         self._open_images: Callable[[], Any] | None = None
         self._is_stopped: Callable[[], bool] = lambda: False
-        self._frames = max(1, round(task.duration_s * robots.rates.fps))
         self._columns: dict[str, NDArray] = {}
         self._length = np.zeros(robots.n, np.int64)
         self.frames = 0
         self.act_times: list[float] = []
         self._gives_goals = False
-        self._drivers = DriverLog(brain, robots.n, self._frames)
+        self._drivers = DriverLog(brain, robots.n)
         self._truth: Any = None
         self._results: Mapping[int, Sequence[CommandResult]] = {}
         environment = task.environment_names
@@ -355,11 +355,16 @@ class EpisodeLoop:
     def _store(self, running: NDArray[np.intp], values: Mapping[str, NDArray]) -> None:
         """Write one frame of the running simulations into their columns."""
         if not self._columns:
+            room = min(self.task.max_frames, _FIRST_FRAMES)
             for key, value in values.items():
                 dtype = keys.SCALARS[key][0] if key in keys.SCALARS else "float32"
                 dtype = {keys.PHYSICS_STATE: "float64", keys.SUBTASK: "object"}.get(key, dtype)
-                self._columns[key] = np.zeros((self.robots.n, self._frames, *value.shape[1:]), dtype)
+                self._columns[key] = np.zeros((self.robots.n, room, *value.shape[1:]), dtype)
         rows = self._length[running]
+        if rows.max(initial=0) == self._columns[keys.ACTION].shape[1]:
+            self._columns = {
+                key: np.concatenate([column, np.zeros_like(column)], axis=1) for key, column in self._columns.items()
+            }
         for key, value in values.items():
             self._columns[key][running, rows] = value[running]
 
@@ -427,7 +432,7 @@ class EpisodeLoop:
             goal_frames=_spans_without(self._streamed[sim], length) if self._streamed[sim] else None,
             plan=plan,
             realtime=None if self.robots.clock is None else self.robots.clock.grants,
-            interventions=self._drivers.interventions(sim, length),
+            interventions=self._drivers.interventions(sim),
         )
 
 

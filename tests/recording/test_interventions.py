@@ -165,7 +165,7 @@ class Stub(Brain):
 
 def test_frames_that_went_by_while_the_brain_thought_belong_to_who_drove_before() -> None:
     stub = Stub()
-    log = DriverLog(stub, 1, 10)
+    log = DriverLog(stub, 1)
     first, length = np.zeros(1, np.intp), np.zeros(1, np.int64)
     log.start(first)
     log.decided()
@@ -174,18 +174,18 @@ def test_frames_that_went_by_while_the_brain_thought_belong_to_who_drove_before(
     log.decided()
     for frame, is_missed in ((1, True), (2, True), (3, False)):
         assert log.frame(first, length + frame, is_missed=is_missed).tolist() == [not is_missed]
-    (only,) = log.interventions(0, 4) or []
+    (only,) = log.interventions(0) or []
     assert (only.first, only.end, only.cause) == (3, 4, "late")
 
 
 def test_frames_that_went_by_before_the_first_decision_belong_to_the_first() -> None:
     stub = Stub()
     stub.taken[:] = True
-    log = DriverLog(stub, 1, 4)
+    log = DriverLog(stub, 1)
     log.start(np.zeros(1, np.intp))
     log.decided()
     assert log.frame(np.zeros(1, np.intp), np.zeros(1, np.int64), is_missed=True).tolist() == [True]
-    assert log.interventions(0, 1) == [Intervention(0, 1, "late")]
+    assert log.interventions(0) == [Intervention(0, 1, "late")]
 
 
 def test_what_ends_an_episode_is_not_overwritten() -> None:

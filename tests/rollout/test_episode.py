@@ -131,6 +131,19 @@ def test_an_action_takes_the_place_of_what_is_left_of_a_chunk(kind: str) -> None
             np.testing.assert_array_equal(second.columns[key], column, err_msg=key)
 
 
+def test_how_long_an_episode_may_last_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A person who ends takes by a key sets a time that is never over; there is room for what is recorded."""
+    rows = script("turtlebot3")
+    wanted = run("turtlebot3", Script(rows))
+    monkeypatch.setattr("bhd_lerobot.rollout.episode._FIRST_FRAMES", 3)
+    for one, other in zip(wanted, run("turtlebot3", Script(rows)), strict=True):
+        for key, column in one.columns.items():
+            np.testing.assert_array_equal(other.columns[key], column, err_msg=key)
+    task = make_task(AvoidConfig(duration_s=1e12), 1, 10)
+    loop = EpisodeLoop(make_simulation(TurtleBot3Config(beams=36), 1), task, Script(rows))
+    assert list(loop.run([EpisodeSpec(0, 0)], lambda: loop.frames == 5)) == []
+
+
 class Once(Script):
     """Gives an arm a goal in the first frame, and goes on with it."""
 
