@@ -29,16 +29,19 @@ EpisodeStats = dict[str, statistics.Stats]
 def compact(
     state: DatasetState, schema: Schema, disk: Disk, lock: RootLock, known: Mapping[int, EpisodeStats] | None = None
 ) -> bool:
-    """Compact a dataset and store all statistics; return False if there was nothing to do."""
+    """Compact a dataset and store all statistics; return False if there was nothing to do.
+
+    Episodes whose statistics are stored were merged with them. Their files become smaller on the way, so that two that
+    were too large for one may not be any more: they stay as they are, or a second call would never have nothing to do.
+    """
+    if not state.rows or (not state.without_stats and (state.root / layout.STATS).exists()):
+        return False
     picks, rows = [Pick(state, row) for row in state.rows], [dict(row) for row in state.rows]
     plan = Plan(picks, rows, {task: index for index, task in enumerate(state.tasks)}, state.info, Files(picks))
     data = data_groups(plan)
     videos = {key: video_groups(plan, key) for key in state.video_keys}
     move_data = not all(group.is_in_place for group in data)
     move_videos = not all(group.is_in_place for groups in videos.values() for group in groups)
-    has_stats = not state.without_stats and (state.root / layout.STATS).exists()
-    if not rows or not (move_data or move_videos or not has_stats):
-        return False
     with Workspace(state.root, disk, lock) as space:
         stats = episode_stats(state, schema, known or {})
         if move_data:

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.datasets.format.video import VideoSettings
+from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.storage.places import wrong_name
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
@@ -252,6 +253,24 @@ def test_resuming_appends_and_touches_full_files_no_more(tmp_path: Path, monkeyp
     with support.resume(root, video=True):
         pass
     assert support.verify(root, 14, video=True, stats=True) == 14
+
+
+@pytest.mark.parametrize("megabytes", [0.03, 0.06])
+def test_what_is_merged_is_merged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, megabytes: float) -> None:
+    """Files become smaller when they are merged; two that would fit into one afterwards stay two."""
+    from bhd_lerobot.datasets.storage import layout
+
+    monkeypatch.setattr(layout, "DATA_FILES_SIZE_IN_MB", megabytes)
+    root = tmp_path / "dataset"
+    with support.create(root) as recorder:
+        for _ in range(30):
+            support.record(recorder)
+    assert len(list((root / "data").rglob("*.parquet"))) > 1
+    assert not repair(root)
+    with support.resume(root):
+        pass
+    assert not repair(root)
+    assert support.read_back(root) == 30
 
 
 @pytest.mark.parametrize("lacking", ["/q", f"stats/{support.CAMERA}"])
