@@ -1,3 +1,3 @@
 """Delete, keep, split, merge and mark."""
 
-__all__ = ["edits", "mark"]
+__all__ = ["edits", "mark", "overlap"]

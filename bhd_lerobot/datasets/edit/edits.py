@@ -12,6 +12,7 @@ import pyarrow as pa
 from bhd_lerobot.datasets.assembly.assemble import EDITS, assemble, check_alike, edit_lines, logged_now
 from bhd_lerobot.datasets.assembly.creation import build_root
 from bhd_lerobot.datasets.assembly.picks import Pick
+from bhd_lerobot.datasets.edit.overlap import each_once
 from bhd_lerobot.datasets.format.identity import FORMAT, conflicts
 from bhd_lerobot.datasets.format.state import DatasetState, corrupt, load_state, no_dataset, read_json
 from bhd_lerobot.datasets.storage import layout
@@ -27,7 +28,15 @@ from bhd_lerobot.datasets.storage.atomic import (
     uninterrupted,
 )
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock, to_json, write_errors
-from bhd_lerobot.errors import ConfigError, DatasetError, DatasetExistsError, DatasetMismatchError, counted, quoted
+from bhd_lerobot.errors import (
+    ConfigError,
+    DatasetError,
+    DatasetExistsError,
+    DatasetMismatchError,
+    brief,
+    counted,
+    quoted,
+)
 from bhd_lerobot.options.units import other_units
 
 
@@ -38,17 +47,23 @@ class EditReport:
     Attributes:
         is_repeated: whether this edit had been completed before, by a process that was killed before it reported it;
             nothing was changed now.
+        left_out: episodes of each source that one before it has, too.
     """
 
     root: Path
     episodes: int
     frames: int
     is_repeated: bool = False
+    left_out: Mapping[Path, Sequence[int]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         note = "; the same edit was interrupted before, after it had been completed: nothing was changed now"
         size = f"{counted(self.episodes, 'episode')}, {counted(self.frames, 'frame')}"
-        return f"{self.root}: {size}{note if self.is_repeated else ''}"
+        lines = [f"{self.root}: {size}{note if self.is_repeated else ''}"]
+        for root, episodes in self.left_out.items():
+            what = f"{counted(len(episodes), 'episode')} of {root}, which a dataset before it has, too"
+            lines.append(f"  left out: {what}: {brief(episodes)}")
+        return "\n".join(lines)
 
 
 type OnDone = Callable[[EditReport], object]
@@ -56,7 +71,7 @@ type OnDone = Callable[[EditReport], object]
 
 
 def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
-    """Make one dataset of all episodes of several, in their order."""
+    """Make one dataset of all episodes of several, in their order; what several of them have is in it once."""
     paths = [Path(root) for root in roots]
     if len(paths) < 2:
         raise ConfigError(f"Merging takes at least two datasets; got {len(paths)}.")
@@ -66,12 +81,16 @@ def merge(roots: Sequence[Path | str], target: Path | str) -> EditReport:
             raise ConfigError(f"{path} is given more than once; its episodes would be in the new dataset twice.")
     with opened(paths) as states:
         check_alike(states)
-        picks = [Pick(state, row) for state in states for row in state.rows]
-        sizes = [{"root": state.root.name, "episodes": len(state.rows)} for state in states]
+        picks, left_out = each_once(states)
+        sizes = [
+            {"root": state.root.name, "episodes": len(state.rows) - len(left_out.get(state.root, ()))}
+            for state in states
+        ]
         recordings = [(state.identity or {}).get("recording", {}) for state in states]
         _check_units(paths, recordings)
         recording = _common(recordings) | ({"differing": names} if (names := _differing(recordings)) else {})
-        return _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, recording)
+        report = _write_new(Path(target), picks, {"edit": "merge", "sources": sizes}, recording)
+        return replace(report, left_out=left_out)
 
 
 def _check_units(paths: Sequence[Path], recordings: Sequence[Mapping[str, Any]]) -> None:

@@ -14,7 +14,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from bhd_lerobot.datasets.edit.edits import delete, merge
+from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.datasets.format.features import EXPERT_ACTION
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.storage.disk import Disk
@@ -42,28 +42,12 @@ from bhd_lerobot.training.plots import draw_rounds
 
 ROUNDS, CURVE = "rounds.json", "rounds.png"
 _DONE = "done.json"
-_OF_A_RUN = ("episode", "timing", "realtime", "versions")  # what differs where the same episode is run again
 _SIGNALLED = 128  # what an exit status is above if a signal stopped the program
 _PROGRAMS: dict[str, Callable[[Sequence[str]], int]] = {
     "bhd-record": partial(run, Program(RecordConfig, lambda config: record(config).exit_status)),
     "bhd-train": partial(run, training.PROGRAM),
     "bhd-eval": partial(run, Program(EvalConfig, lambda config: evaluate(config).exit_status)),
 }
-
-
-def _repeated(root: Path) -> list[int]:
-    """Return the numbers of episodes of which an earlier one has the same start, brain and end: what was copied."""
-    known: set[str] = set()
-    repeated = []
-    for one in dataset_info(root).episodes:
-        metadata = {name: value for name, value in one.metadata.items() if name not in _OF_A_RUN}
-        if metadata.get("seed") is None:
-            continue  # of another recorder, which does not say how the episode came about
-        key = json.dumps([one.frames, metadata], sort_keys=True, default=lambda value: value.tolist())
-        if key in known:
-            repeated.append(one.index)
-        known.add(key)
-    return repeated
 
 
 class _StoppedError(Exception):
@@ -258,10 +242,8 @@ class _Rounds:
         # Merging is quick, and a merge that was cut short leaves nothing.
         shutil.rmtree(target, ignore_errors=True)
         self._say(number, f"merge {' '.join(map(str, parts))}")
-        merge(parts, target)
-        if twice := _repeated(target):
-            self._say(number, f"leave out {len(twice)} episodes that are in these datasets more than once")
-            delete(target, twice)
+        if twice := sum(map(len, merge(parts, target).left_out.values())):
+            self._say(number, f"leave out {twice} episodes that are in these datasets more than once")
         return target
 
     def _evaluate(self, number: int, folder: Path) -> None:

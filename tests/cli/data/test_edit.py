@@ -22,10 +22,11 @@ def recorded(tmp_path_factory) -> Path:
 @pytest.mark.law
 def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) -> None:
     whole = content(recorded)
-    two = shutil.copytree(recorded, tmp_path / "two")
-    assert main.main(["merge", str(recorded), str(two), "--output", str(tmp_path / "all")]) == 0
-    assert content(tmp_path / "all") == whole + whole
-    assert main.main(["delete", str(tmp_path / "all"), "--episodes", "0-5"]) == 0
+    two, more = shutil.copytree(recorded, tmp_path / "two"), record(tmp_path / "more", [6, 7])
+    merged = ["merge", str(more), str(recorded), str(two), "--output", str(tmp_path / "all")]
+    assert main.main(merged) == 0
+    assert content(tmp_path / "all") == content(more) + whole
+    assert main.main(["delete", str(tmp_path / "all"), "--episodes", "0-1"]) == 0
     assert content(tmp_path / "all") == whole
     assert main.main(["mark", str(two), "--episodes", "1,3-4", "--outcome", "stuck", "--note", "wheel"]) == 0
     assert [episode.metadata["outcome"] for episode in dataset_info(two).episodes].count("stuck") == 3
@@ -41,7 +42,8 @@ def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) 
     assert main.main(["split", str(recorded), "--parts", "a=0,5;b=1-2", "--output", str(tmp_path / "q")]) == 0
     assert content(tmp_path / "q/a") == [whole[0], whole[5]]
     out = capsys.readouterr().out
-    assert f"{tmp_path / 'all'}: 12 episodes" in out
+    assert f"{tmp_path / 'all'}: 8 episodes" in out
+    assert f"left out: 6 episodes of {two}, which a dataset before it has, too: 0, 1, 2, 3, 4, 5\n" in out
     assert content(recorded) == whole
 
 

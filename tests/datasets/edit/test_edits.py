@@ -51,6 +51,38 @@ def test_merge_gives_all_episodes_in_order(tmp_path: Path, video: bool) -> None:
     assert_valid(tmp_path / "all")
 
 
+def test_what_several_datasets_have_is_merged_once(plain: Path, tmp_path: Path) -> None:
+    """A part of another one, marked since, and what was recorded again: an episode is what was observed and done."""
+    marked = Path(shutil.copytree(plain, tmp_path / "marked"))
+    mark(marked, [2], outcome="failure")
+    keep(marked, [4, 2], tmp_path / "part")
+    more = record(tmp_path / "more", [7, 1])
+    report = merge([plain, tmp_path / "part", more], tmp_path / "all")
+    assert content(tmp_path / "all") == [*content(plain), content(more)[0]]
+    assert_valid(tmp_path / "all")
+    assert report.left_out == {tmp_path / "part": [0, 1], more: [1]}
+    assert f"left out: 2 episodes of {tmp_path / 'part'}, which a dataset before it has, too: 0, 1" in str(report)
+    assert [one["episodes"] for one in edits_of(tmp_path / "all")[-1]["sources"]] == [6, 0, 1]
+
+
+def test_episodes_that_only_look_alike_are_all_merged(tmp_path: Path) -> None:
+    """With other words or another seed the same frames are another episode; of one without any motion nobody knows."""
+
+    def recorded(name: str, *, task: str = "t", seed: int = 0, is_still: bool = False) -> Path:
+        with support.create(tmp_path / name) as recorder:
+            writer, columns = recorder.begin_episode(), support.columns(0)
+            if is_still:
+                columns["observation.state"][:] = 1.0
+            writer.set_columns(columns)
+            recorder.save(writer, task=task, metadata={**support.metadata(0), "seed": seed})
+        return tmp_path / name
+
+    pairs = [(recorded("a"), recorded("b", task="u")), (recorded("c"), recorded("d", seed=1))]
+    pairs.append((recorded("e", is_still=True), recorded("f", is_still=True)))
+    for number, pair in enumerate(pairs):
+        assert merge(pair, tmp_path / str(number)).episodes == 2
+
+
 def test_an_edited_dataset_is_not_continued(plain: Path, tmp_path: Path) -> None:
     """Its next episode would not be the one of its seed."""
     keep(plain, [0, 1], tmp_path / "kept")
@@ -107,7 +139,7 @@ def test_unchanged_files_are_linked(tmp_path: Path) -> None:
 
 def test_full_files_are_not_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the next one would not fit into a file another is begun, for data and for videos."""
-    parts = [record(tmp_path / f"d{i}", [i, i + 1], video=True) for i in range(3)]
+    parts = [record(tmp_path / f"d{i}", [2 * i, 2 * i + 1], video=True) for i in range(3)]
     whole = [episode for part in parts for episode in content(part)]
     for kind, megabytes in (("data", layout.DATA_FILES_SIZE_IN_MB), ("videos", layout.VIDEO_FILES_SIZE_IN_MB)):
         size = max(path.stat().st_size for part in parts for path in (part / kind).rglob("file-*"))
@@ -119,7 +151,7 @@ def test_full_files_are_not_merged(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_edits_are_logged(tmp_path: Path) -> None:
-    roots = [record(tmp_path / name, [0, 1]) for name in ("a", "b")]
+    roots = [record(tmp_path / name, episodes) for name, episodes in (("a", [0, 1]), ("b", [2, 3]))]
     merge(roots, tmp_path / "all")
     delete(tmp_path / "all", [2])
     keep(tmp_path / "all", [1], tmp_path / "one")
@@ -235,7 +267,7 @@ def test_columns_and_files_of_other_programs_are_kept(plain: Path, tmp_path: Pat
     assert operators(tmp_path / "kept") == ["person 4", "person 1"]
     assert (tmp_path / "kept/meta/subtasks.json").exists()
     merge([tmp_path / "kept", plain], tmp_path / "all")
-    assert operators(tmp_path / "all") == ["person 4", "person 1"] + [None] * 6
+    assert operators(tmp_path / "all") == ["person 4", "person 1"] + [None] * 4
     before = [one.columns for one in content(root)]
     mark(root, [0], outcome="failure")
     assert operators(root) == [f"person {index}" for index in range(6)]

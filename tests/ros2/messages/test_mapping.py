@@ -108,7 +108,7 @@ def test_a_key_that_is_there_twice_is_named(tmp_path: Path) -> None:
     """YAML would take the last: an action of which another field moves than the one that was read first."""
     entry = "{topic: /odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}"
     (tmp_path / "robot.yaml").write_text(f"observation:\n  x.vel: {entry}\n  x.vel: {entry}\n")
-    with pytest.raises(ConfigError, match="'x.vel' occurs twice .* line 2; leave one of them"):
+    with pytest.raises(ConfigError, match=r"'x.vel' occurs twice .* line 2; leave one of them"):
         MappingConfig.load(tmp_path / "robot.yaml")
 
 
