@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from bhd_lerobot.datasets.format.features import (
     dataset_features,
 )
 from bhd_lerobot.datasets.format.summary import DatasetSummary, dataset_info
+from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, ConfigError
@@ -127,7 +128,10 @@ def closing_used(recorder: DatasetRecorder, *, is_new: bool) -> Iterator[Dataset
     finally:
         info = info_of(recorder.root)
         if is_new and info is not None and not info.episodes:
-            shutil.rmtree(recorder.root, ignore_errors=True)
+            for name in ("meta", "data", "videos", layout.STAGING):
+                shutil.rmtree(recorder.root / name, ignore_errors=True)
+            with suppress(OSError):  # a link, or a mount point, stays
+                recorder.root.rmdir()
 
 
 def language_column(plan: dict[str, Any], subtasks: NDArray, fps: int) -> NDArray:

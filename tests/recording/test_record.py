@@ -210,6 +210,21 @@ def test_a_failing_save_leaves_the_earlier_episodes_and_names_the_cause(tmp_path
     assert dataset_info(tmp_path / "d").compact
 
 
+def test_a_run_without_an_episode_leaves_a_link_to_an_empty_folder_as_it_was(tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise BhdError("It is broken.")
+
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "d").symlink_to("disk")
+    with monkeypatch.context() as patch:
+        patch.setattr(record_module, "save_episode", fail)
+        with pytest.raises(BhdError, match="It is broken"):
+            run_record(tmp_path / "d")
+    assert list((tmp_path / "disk").iterdir()) == []
+    result, _ = run_record(tmp_path / "d", dataset__num_episodes=1, dataset__episode_time_s=0.5)
+    assert result.episodes == 1
+
+
 def test_the_run_folder_has_the_resolved_configuration_and_an_image(recorded):
     root, result, text = recorded
     folder = root.parent / "d_run"
