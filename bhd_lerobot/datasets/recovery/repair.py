@@ -116,7 +116,7 @@ def _repair_with(root: Path, donor: Path, disk: Disk, lock: RootLock) -> RepairR
     """
     consequence = "Its files are as they were."
     with write_errors("repair the dataset", root, consequence):
-        roll_forward(root, disk)
+        roll_forward(root)
         clean(root)
         adopted, saved = replace_info(root, donor, disk)
     try:
@@ -132,7 +132,7 @@ def _repair_foreign(root: Path, disk: Disk, lock: RootLock, *completed: str) -> 
     """Repair what another program wrote: nothing if all of it can be read, and else everything that is whole."""
     with write_errors("repair the dataset", root, "Its files are as they were."):
         remove_abandoned(real(root))
-        if roll_forward(root, disk):
+        if roll_forward(root):
             completed += ("a change that was interrupted while its files were moved in",)
         disk.remove_tree(root / layout.STAGING)  # of an attempt that was interrupted
     try:
@@ -209,7 +209,7 @@ def restore_committed(root: Path, disk: Disk, *, keep_staging: bool = False) -> 
     """
     check_fetched(root)
     remove_abandoned(real(root))
-    completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root, disk) else []
+    completed = ["a change that was interrupted while its files were moved in"] if roll_forward(root) else []
     state = load_state(root)
     dropped: list[str] = []
     if state.identity is not None:

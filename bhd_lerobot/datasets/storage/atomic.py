@@ -5,8 +5,9 @@ A new folder is made in a hidden folder beside its place and renamed once.
 Of an existing dataset the folders `meta`, `data` and `videos` are replaced; the folder itself, files of other programs
 and mount points stay. The new folders are made in the staging folder. Then a marker is written, with which the change
 is decided, and each new folder is swapped with the old one: atomically, or with two renames where the file system has
-no atomic swap. A kill in between leaves old and new folders side by side. Every command that finds the marker completes
-the change first and reports it. Stock LeRobot does not know the marker and would mix the folders; therefore
+no atomic swap. All of this is flushed to the device: what it replaces may have been there for long, and a power failure
+shall not take it away. A kill in between leaves old and new folders side by side. Every command that finds the marker
+completes the change first and reports it. Stock LeRobot does not know the marker and would mix the folders; therefore
 ``info.json`` has an invalid version until all of them are in place.
 """
 
@@ -65,7 +66,7 @@ class Workspace:
         self._shell = place / WORK / "build"
         try:
             if self._is_inside:
-                roll_forward(place, disk)
+                roll_forward(place)
                 disk.remove_tree(place / WORK)
                 disk.make_folder(self._shell)
             else:
@@ -91,7 +92,7 @@ class Workspace:
         Signals that would end the process wait until it is done.
         """
         if self._is_inside:
-            move_in(self.folder, self.place, self._disk, done=done, is_new=self._is_new, goes=goes)
+            move_in(self.folder, self.place, done=done, is_new=self._is_new, goes=goes)
             return
         with uninterrupted():
             self._disk.move(self.folder, self.place)  # fails if another program has created it meanwhile
@@ -130,7 +131,7 @@ def building(target: Path, disk: Disk, refuse: Callable[[], None]) -> Iterator[W
         space.publish(f"{target} had been made")
 
 
-def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = False, goes: Collection[str] = ()) -> None:
+def move_in(new: Path, place: Path, *, done: str, is_new: bool = False, goes: Collection[str] = ()) -> None:
     """Move the content of a folder to the places of the same names in another one, which the caller has locked.
 
     Signals that would end the process wait until it is done.
@@ -139,7 +140,7 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
         done: the result, a sentence without a full stop; see `noting_what_is_done`.
         is_new: nothing may be at these places.
     """
-    work = place / WORK
+    work, disk, device = place / WORK, Disk(), Disk(fsync=True)
     if not new.is_relative_to(work):
         disk.remove_tree(work)
         disk.make_folder(work)
@@ -150,10 +151,11 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
             if (new / layout.INFO).is_file():
                 _write_invalid_info(place, disk)
             disk.move(new, work / "new")
+            device.flush_tree(work / "new")
             inodes = {name: (work / "new" / name).lstat().st_ino for name in _names(work / "new")}
             plan = {"root": place.stat().st_ino, "new": inodes, "goes": sorted(goes), "is_new": is_new}
-            disk.write(work / "ready.tmp", json.dumps(plan).encode())
-            disk.move(work / "ready.tmp", place / _MARKER)
+            device.write(work / "ready.tmp", json.dumps(plan).encode())
+            device.move(work / "ready.tmp", place / _MARKER)
         except BaseException:
             with contextlib.suppress(OSError):
                 (work / "new").rename(new)
@@ -162,7 +164,7 @@ def move_in(new: Path, place: Path, disk: Disk, *, done: str, is_new: bool = Fal
         before = None if sentences is None else list(sentences)
         note_done(f"the change of {place} is committed, and the next command completes it")
         with _decided(place):
-            roll_forward(place, disk)
+            roll_forward(place)
         if sentences is not None and before is not None:
             sentences[:] = [*before, done]
 
@@ -219,20 +221,22 @@ def is_decided(place: Path) -> bool:
     return os.path.isfile(place / _MARKER)
 
 
-def roll_forward(place: Path, disk: Disk) -> bool:
+def roll_forward(place: Path) -> bool:
     """Complete a change that had been decided; return whether there was one. The caller has locked the place."""
     if not is_decided(place):
         return False
-    plan = _read_plan(place)
+    plan, disk, device = _read_plan(place), Disk(), Disk(fsync=True)
     new, old = place / WORK / "new", place / WORK / "old"
     disk.make_folder(old)
     for name in plan.goes:
         if os.path.lexists(place / name):
             disk.move(place / name, _unused(old / name))
     if (place / _INVALID).is_file() and not _is_there(place / "meta", plan.new.get("meta")):
-        disk.move(place / _INVALID, place / layout.INFO)
+        device.move(place / _INVALID, place / layout.INFO)
     for name in sorted({*_names(new), *plan.new}, key=lambda name: (_ORDER.get(name, 0), name)):
         _replace(new / name, place / name, old / name, plan, disk)
+    for folder in (place, old):
+        device.flush_folder(folder)
     disk.remove(place / _MARKER)
     disk.try_remove_tree(place / WORK)
     with contextlib.suppress(OSError):
@@ -247,7 +251,7 @@ def complete_interrupted(place: Path) -> bool:
     lock = RootLock(place)
     try:
         with _decided(place), uninterrupted():
-            was_there = roll_forward(place, Disk())
+            was_there = roll_forward(place)
     finally:
         lock.release()
     if was_there:

@@ -11,6 +11,7 @@ import fcntl
 import json
 import os
 import shutil
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,9 @@ _REMEDIES = {
 # Linux's own numbers.
 _FICLONE = 0x40049409  # let both files have the same blocks until one of them is written
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+
+_NO_FLUSH = (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.EOPNOTSUPP)
+"""What file systems answer that cannot flush a folder, such as those that a virtual machine shares with its host."""
 
 
 def _before_step(action: str, path: Path) -> None:
@@ -60,7 +64,9 @@ class Disk:
             raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(missing))
         _before_step("mkdir", path)
         path.mkdir(parents=True, exist_ok=True)
-        self._flush_folder(missing.parent)
+        while path != missing.parent:
+            path = path.parent
+            self.flush_folder(path)
 
     def write(self, path: Path, content: bytes | memoryview) -> None:
         """Write a new file. `path` must be a staging path: a kill leaves it half written."""
@@ -82,11 +88,20 @@ class Disk:
             with open(path, "rb") as file:
                 os.fsync(file.fileno())
 
+    def flush_tree(self, folder: Path) -> None:
+        """Flush every new file below a folder, and every folder, if flushing is on; further names of files are old."""
+        for place, _, names in os.walk(folder, topdown=False):
+            for path in (Path(place, name) for name in names):
+                about = path.lstat()
+                if stat.S_ISREG(about.st_mode) and about.st_nlink == 1:
+                    self.flush(path)
+            self.flush_folder(Path(place))
+
     def move(self, source: Path, target: Path) -> None:
         """Rename a file or folder; an existing target file is replaced in one step."""
         _before_step("rename", target)
         os.replace(source, target)
-        self._flush_folder(target.parent)
+        self.flush_folder(target.parent)
 
     def publish(self, path: Path, content: bytes, staging: Path | None = None) -> None:
         """Write a file beside its place, or in a staging folder, and rename it: it is there completely or as before."""
@@ -106,7 +121,7 @@ class Disk:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number), str(first), None, str(second))
         for folder in {first.parent, second.parent}:
-            self._flush_folder(folder)
+            self.flush_folder(folder)
 
     def link(self, source: Path, target: Path) -> None:
         """Give a file a second name, or copy it where the file system cannot do that."""
@@ -145,11 +160,15 @@ class Disk:
         with contextlib.suppress(OSError):
             self.remove_tree(path)
 
-    def _flush_folder(self, path: Path) -> None:
+    def flush_folder(self, path: Path) -> None:
+        """Flush a folder, if flushing is on: what is in it, and under which name."""
         if self.fsync:
             handle = os.open(path, os.O_RDONLY)
             try:
                 os.fsync(handle)
+            except OSError as error:
+                if error.errno not in _NO_FLUSH:
+                    raise
             finally:
                 os.close(handle)
 

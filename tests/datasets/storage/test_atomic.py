@@ -1,11 +1,14 @@
 """New content takes its place in one step, wherever that is; the sweeps say what happens when it is disturbed."""
 
+import errno
 import json
 import logging
 import os
 import shutil
 import signal
+import stat
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +19,7 @@ from bhd_lerobot.datasets.edit.edits import delete, keep, merge, split
 from bhd_lerobot.datasets.edit.mark import mark
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.loader.table import open_metadata
+from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.storage import atomic, disk, layout
 from bhd_lerobot.datasets.storage.disk import Disk, RootLock
@@ -79,6 +83,57 @@ def test_files_that_others_write_during_an_edit_stay(root: Path, monkeypatch: py
     assert len(list((root / "own").iterdir())) == count + 1
     assert (root / "own/notes").read_text() == (root / "late.txt").read_text() == str(count)
     assert root.stat().st_ino == inode, "who stands in it, or has mounted it, sees the new content"
+
+
+def recording_on(root: Path) -> Callable[[], object]:
+    """Save a further episode; return what finalises the dataset."""
+    recorder = support.resume(root)
+    support.record(recorder)
+    return recorder.finalize
+
+
+def without_statistics(root: Path) -> Callable[[], object]:
+    """Remove the statistics; return what computes them."""
+    (root / layout.STATS).unlink()
+    return lambda: fix(root, check_dataset(root).findings)
+
+
+@pytest.mark.law
+@pytest.mark.parametrize("prepare", [lambda root: lambda: delete(root, [1]), recording_on, without_statistics])
+def test_the_old_content_goes_when_the_new_is_on_the_device(
+    root: Path, monkeypatch: pytest.MonkeyPatch, prepare: Callable[[Path], Callable[[], object]]
+) -> None:
+    """A power failure right after an edit, or after a recording, costs nothing that was saved long before."""
+    change, fsync = prepare(root), os.fsync
+    safe = {path.lstat().st_ino for path in root.rglob("*")}
+    found: list[Path] = []
+
+    def flush(handle: int) -> None:
+        fsync(handle)
+        safe.add(os.fstat(handle).st_ino)
+
+    def look(action: str, path: Path) -> None:
+        if action == "rmtree" and path == root / atomic.WORK and not found:
+            found.extend(one for one in (root, *root.rglob("*")) if not one.is_relative_to(root / layout.STAGING))
+            assert [str(one) for one in found if one.lstat().st_ino not in safe] == []
+
+    monkeypatch.setattr(os, "fsync", flush)
+    monkeypatch.setattr(disk, "_before_step", look)
+    change()
+    assert root / layout.STATS in found
+
+
+def test_a_file_system_that_cannot_flush_folders_will_do(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fsync = os.fsync
+
+    def flush(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", flush)
+    delete(root, [1])
+    assert len(content(root)) == 2
 
 
 @pytest.mark.law
