@@ -80,7 +80,13 @@ def open_recorder(recording: Recording, robots: Robots, task: Task, brain: Brain
         about["brain"] = _as_named_then(about["brain"], info.recording.get("brain"))
     make = DatasetRecorder.resume if is_continued else DatasetRecorder.create
     recorder = make(
-        recording.repo_id, recording.fps, features, robot_type=name_of_robot(robots.config), root=root, recording=about
+        recording.repo_id,
+        recording.fps,
+        features,
+        robot_type=name_of_robot(robots.config),
+        root=root,
+        recording=about,
+        fsync=robots.world is None,  # a real robot is switched off, and its loop does not wait for a save
     )
     if robots.clock is not None and robots.camera_shapes:
         recorder.encode_in_process()  # on the wall clock the loop waits for no encoder

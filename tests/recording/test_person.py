@@ -6,6 +6,7 @@ import re
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.encoder_process import EncoderProcess
+from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.recording.status import RecordStatus
 from bhd_lerobot.rollout.marks import Marks
@@ -44,6 +46,28 @@ def test_a_fault_at_the_first_frame_has_its_status_a_summary_and_a_hint_and_leav
     if not is_saved:
         assert "No episode was running." in text
         assert run(root, dataset__num_episodes=1)[0].recorded == 1  # the same command
+
+
+def test_a_take_that_is_saved_survives_that_the_robot_is_switched_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The computer with it: every file of a saved take is on the device, before more is recorded."""
+    save, fsync = DatasetRecorder.save, os.fsync
+    safe: set[int] = set()
+    unsafe: list[list[Path]] = []
+
+    def flush(handle: int) -> None:
+        fsync(handle)
+        safe.add(os.fstat(handle).st_ino)
+
+    def look(self: DatasetRecorder, *arguments: Any, **options: Any) -> int:
+        index = save(self, *arguments, **options)
+        files = [one for name in ("meta", "data", "videos") for one in (self.root / name).rglob("*") if one.is_file()]
+        unsafe.append([one for one in files if one.stat().st_ino not in safe])
+        return index
+
+    monkeypatch.setattr(os, "fsync", flush)
+    monkeypatch.setattr(DatasetRecorder, "save", look)
+    run(tmp_path / "d", dataset__num_episodes=1, task__duration_s=1)
+    assert unsafe == [[]]
 
 
 def test_a_leader_that_cannot_be_connected_leaves_no_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import pytest
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.format.video import VideoSettings
 from bhd_lerobot.datasets.recovery.repair import repair
-from bhd_lerobot.datasets.storage import disk
+from bhd_lerobot.datasets.storage import disk, layout
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import (
     DatasetCorruptError,
@@ -283,11 +283,29 @@ def test_an_error_in_the_block_is_not_hidden_by_one_of_finalising(tmp_path, monk
     assert support.read_back(tmp_path / "d") == 1
 
 
-def test_flushing_to_the_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flushed: list[int] = []
-    real = os.fsync
-    monkeypatch.setattr(os, "fsync", lambda handle: (flushed.append(handle), real(handle))[1])
-    with support.create(tmp_path / "d", fsync=True) as recorder:
-        support.record(recorder)
-        assert len(flushed) > 8
-    assert support.read_back(tmp_path / "d") == 1
+@pytest.mark.parametrize("video", [False, True])
+def test_what_counts_is_on_the_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, video: bool) -> None:
+    """With `fsync`, an episode exists when all of it survives a power failure, also the folders that name its files."""
+    root, staged, fsync = tmp_path / "d", tmp_path / "d" / layout.STAGING, os.fsync
+    safe: set[int] = set()
+    looks = 0
+
+    def flush(handle: int) -> None:
+        fsync(handle)
+        safe.add(os.fstat(handle).st_ino)
+
+    def look(action: str, path: Path) -> None:
+        nonlocal looks
+        if (action, path) == ("rename", root / layout.INFO):
+            looks += 1
+            there = [one for one in (root, *root.rglob("*")) if not one.is_relative_to(staged)]
+            there += staged.glob("save/info.json")
+            assert [str(one) for one in there if one.stat().st_ino not in safe] == []
+
+    monkeypatch.setattr(os, "fsync", flush)
+    monkeypatch.setattr(disk, "_before_step", look)
+    with support.create(root, video=video, fsync=True) as recorder:
+        for episode in range(2):
+            support.record(recorder, video=video)
+            assert looks == episode + 1
+    assert support.read_back(root) == 2
