@@ -41,6 +41,9 @@ _MOST_COUNTED = 2**63 - 1
 _FPS = (1e-3, 1e6)  # [Hz] beyond them, times of frames are no numbers any more that a clock has
 _DIMENSIONS = 5  # as many as LeRobot's columns have
 
+CONVERT = "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=USER/NAME --root=FOLDER --push-to-hub=false"
+"""Command that converts a dataset in a folder, or first downloads it to there."""
+
 
 class InfoError(ValueError):
     """The content of an `info.json` is not valid. The message has neither the name of the file nor a remedy."""
@@ -75,7 +78,7 @@ def checked_info(
     if not str(values["codebase_version"]).startswith("v3."):
         raise DatasetError(
             f"{place} has dataset format {shown(values['codebase_version'], quoted=False)}; this program reads v3.x. "
-            "LeRobot converts older ones."
+            f"LeRobot converts v2.1, and keeps the old one beside it: {CONVERT}"
         )
     info = {**_DEFAULTS, **values}
     info["splits"] = {} if values.get("splits") is None else values["splits"]

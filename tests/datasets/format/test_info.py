@@ -1,6 +1,7 @@
 """One reader of `meta/info.json`: LeRobot's defaults for what is missing, and a clear error for what is not valid."""
 
 import copy
+import importlib.util
 import json
 import math
 import shutil
@@ -11,7 +12,7 @@ import pytest
 from lerobot.datasets.utils import DatasetInfo
 
 from bhd_lerobot.datasets.edit.edits import keep
-from bhd_lerobot.datasets.format.info import COUNTS, InfoError, checked_info, parse_object
+from bhd_lerobot.datasets.format.info import CONVERT, COUNTS, InfoError, checked_info, parse_object
 from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.loader.table import open_metadata
 from bhd_lerobot.datasets.recovery.repair import repair
@@ -103,6 +104,8 @@ def test_anything_but_a_json_object_is_refused_with_a_reason() -> None:
 
 
 def test_another_version_is_reported_first() -> None:
+    module = CONVERT.split()[2]
+    assert importlib.util.find_spec(module) is not None
     for version in ("v2.1", 3.0, None):
-        with pytest.raises(DatasetError, match=rf"dataset format {version}; this program reads v3\.x"):
+        with pytest.raises(DatasetError, match=rf"dataset format {version}; this program reads v3\.x.* {module} "):
             checked_info({"codebase_version": version, "features": 3, "fps": "x"}, "d", counts=False)
