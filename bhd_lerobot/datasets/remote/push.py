@@ -1,17 +1,23 @@
 """Copy a dataset to the Hub or below a URL: what differs, and nothing else."""
 
+import contextlib
 import hashlib
 import re
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from bhd_lerobot.datasets.assembly.assemble import EDITS
+from bhd_lerobot.datasets.format.episode_table import read_stats
 from bhd_lerobot.datasets.format.identity import as_text, conflicts
 from bhd_lerobot.datasets.format.info import InfoError, parse_object
-from bhd_lerobot.datasets.format.state import DatasetState
+from bhd_lerobot.datasets.format.state import UNREADABLE, DatasetState
 from bhd_lerobot.datasets.remote.listing import CARD, PREVIEW, RemoteFile, is_recorded, matching, parse_info
 from bhd_lerobot.datasets.remote.local import LocalDataset, open_local
 from bhd_lerobot.datasets.remote.store import Remote, refuse_overlap
@@ -19,6 +25,7 @@ from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.errors import DatasetError, DatasetExistsError, brief
 
 _SIGNATURE = re.compile(r"\n<!-- bhd-card ([0-9a-f]{64}) -->\n\Z")
+_EPISODES = "meta/episodes/"
 
 
 @dataclass(frozen=True)
@@ -145,6 +152,11 @@ def _refuse_another(local: LocalDataset, remote: Remote, there: Mapping[str, Rem
         raise DatasetExistsError(
             f"{name} is another recording than {local.root}: {brief(conflicts, 3)}. Choose another place, {remedy}"
         )
+    if (episode := _other_episode(local, remote, there)) is not None:
+        raise DatasetExistsError(
+            f"{name} is another recording than {local.root}, with the same options: episode {episode} has other frames "
+            f"there. Choose another place, {remedy}"
+        )
     own = local.files[EDITS].read_bytes().splitlines() if EDITS in local.files else []
     if lost := [line for line in (edits or b"").splitlines() if line not in own]:
         raise DatasetExistsError(
@@ -159,6 +171,40 @@ def _other(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile],
     if file is None or (file.digest is not None and path in local.files and file.matches(local.files[path])):
         return None
     return remote.read(path)
+
+
+def _other_episode(local: LocalDataset, remote: Remote, there: Mapping[str, RemoteFile]) -> int | None:
+    """Return the first episode that has other frames there than here; None if none is known to have."""
+    paths = [path for path in there if path.startswith(_EPISODES) and is_recorded(path)]
+    theirs = _limits(content for path in paths if (content := _other(local, remote, there, path)) is not None)
+    if not theirs:
+        return None
+    ours = _limits(file.read_bytes() for path, file in local.files.items() if path.startswith(_EPISODES))
+    for episode in sorted(theirs.keys() & ours.keys()):
+        if any(ours[episode].get(name, value) != value for name, value in theirs[episode].items()):
+            return episode
+    return None
+
+
+def _limits(files: Iterable[bytes]) -> dict[int, dict[str, Any]]:
+    """Return the length of each episode in files of `meta/episodes`, and the limits of what was observed and done.
+
+    By these the frames are known: marks do not change them, nor does a program that computes statistics anew.
+    """
+    known: dict[int, dict[str, Any]] = {}
+    for content in files:
+        with contextlib.suppress(*UNREADABLE, KeyError):  # damaged there: nothing is known of it
+            file = pq.ParquetFile(pa.BufferReader(content))
+            rows, stats = file.read(columns=["episode_index", "length"]).to_pylist(), read_stats(file)
+            learned = [(key, stat) for key, stat in stats.items() if key.startswith(("observation", "action"))]
+            for place, row in enumerate(rows):
+                known[row["episode_index"]] = {"length": row["length"]} | {
+                    f"{key} {name}": (stat[name][place] + 0.0).astype(np.float32).tobytes()  # -0 is 0
+                    for key, stat in learned
+                    for name in ("min", "max")
+                    if stat[name].ndim == 2  # of an image they are those of a sample
+                }
+    return known
 
 
 def _conflicts(theirs: bytes | None, ours: Mapping[str, Any] | None) -> list[str]:

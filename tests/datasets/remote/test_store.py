@@ -10,12 +10,15 @@ import pytest
 
 from bhd_lerobot.datasets.edit.edits import merge
 from bhd_lerobot.datasets.edit.mark import mark
+from bhd_lerobot.datasets.recovery.fix import fix
 from bhd_lerobot.datasets.remote.pull import pull
 from bhd_lerobot.datasets.remote.push import push
 from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.datasets.storage import layout
+from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import ConfigError, DatasetExistsError, TransferError
 from tests.datasets import support
+from tests.datasets.edit_support import record
 from tests.datasets.foreign import edit_json
 from tests.datasets.remote.store_fixtures import KEYS, stored, use_s3
 from tests.datasets.support import snapshot as content
@@ -42,6 +45,20 @@ def test_what_is_no_later_version_replaces_nothing(root: Path, near_url: str, tm
     assert stored(url) == before
     assert push(tmp_path / "small", StoreDataset(url), replace=True).deleted
     assert stored(url) == content(tmp_path / "small")
+
+
+def test_another_recording_with_the_same_options_replaces_nothing(near_url: str, tmp_path: Path) -> None:
+    """The same command records other episodes of a real robot; what computes statistics anew makes no other one."""
+    one, other = record(tmp_path / "one", [0, 1, 2]), record(tmp_path / "other", [0, 4, 5])
+    push(one, StoreDataset(near_url))
+    before = stored(near_url)
+    with pytest.raises(DatasetExistsError, match=r"with the same options: episode 1 has other frames there.*--replace"):
+        push(other, StoreDataset(near_url))
+    assert stored(near_url) == before
+    (one / layout.STATS).unlink()
+    fix(one, check_dataset(one).findings)
+    push(one, StoreDataset(near_url))
+    assert push(other, StoreDataset(near_url), replace=True).episodes == 3
 
 
 def test_another_recording_and_what_was_marked_there_are_not_overwritten(
