@@ -219,6 +219,7 @@ def _rows(
 def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str, statistics.Stats]:
     """Return feature -> statistic -> values of all episodes, shape (E, ...): the old ones where nothing changed."""
     files: dict[tuple[int, Slot], tuple[dict[int, int], dict[str, statistics.Stats]]] = {}
+    read: dict[tuple[int, Slot], dict[int, pa.Table]] = {}  # of one data file: its episodes follow each other
     stacked: dict[str, dict[str, list[np.ndarray]]] = {}
     for place, pick in enumerate(plan.picks):
         slot = slot_of(pick.row, "meta/episodes")
@@ -230,13 +231,14 @@ def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str
         index = places[pick.row["episode_index"]]
         own = {key: {name: values[index] for name, values in stat.items()} for key, stat in stored.items()}
         row = plan.rows[place]
-        columns: dict[str, np.ndarray] = _impossible(plan, place, own) | {
+        columns: dict[str, np.ndarray] = _impossible(plan, place, own, read) | {
             "episode_index": np.full(row["length"], place),
             "index": np.arange(row["dataset_from_index"], row["dataset_to_index"]),
             "task_index": plan.task_indexes(place),
             **pick.columns,
         }
-        fresh = statistics.column_stats({key: values for key, values in columns.items() if key in own})
+        # What another program stored may hold what is not finite.
+        fresh = statistics.column_stats({key: one for key, one in columns.items() if key in own}, finite=False)
         for key, stat in {**own, **fresh}.items():
             for name in own[key]:
                 stacked.setdefault(key, {}).setdefault(name, []).append(stat.get(name, own[key][name]))
@@ -256,23 +258,29 @@ def _stats(plan: Plan, known: Mapping[str, statistics.Stats] | None) -> dict[str
     return {key: {name: np.stack(values) for name, values in stat.items()} for key, stat in stacked.items()}
 
 
-def _impossible(plan: Plan, place: int, stats: Mapping[str, statistics.Stats]) -> dict[str, np.ndarray]:
-    """Return the columns of an episode whose stored standard deviation cannot be theirs, each of shape (T, d)."""
+def _impossible(
+    plan: Plan, place: int, stats: Mapping[str, statistics.Stats], read: dict[tuple[int, Slot], dict[int, pa.Table]]
+) -> dict[str, np.ndarray]:
+    """Return the columns of an episode whose stored standard deviation cannot be theirs, each of shape (T, d).
+
+    Args:
+        read: the frames of the episodes of the data file that was read last.
+    """
     source, row = plan.picks[place].source, plan.picks[place].row
     features = source.info["features"]
-    wrong = [
+    judged = [
         key
-        for key, stat in stats.items()
-        if key in features
-        and features[key]["dtype"] not in ("image", "video")
-        and len(features[key]["shape"]) == 1
-        and not statistics.are_possible(stat).all()
+        for key in stats.keys() & features.keys()
+        if features[key]["dtype"] not in ("image", "video") and len(features[key]["shape"]) == 1
     ]
+    wrong = [key for key in judged if not statistics.are_possible(stats[key]).all()]
     if not wrong:
         return {}
     slot = slot_of(row, "data")
-    path, rows = source.root / layout.data_file(slot), plan.files.rows(source, "data")[slot]
-    frames = frames_of(path, rows, wrong)[row["episode_index"]]
+    if (file := (id(source), slot)) not in read:
+        read.clear()
+        read[file] = frames_of(source.root / layout.data_file(slot), plan.files.rows(source, "data")[slot], judged)
+    frames = read[file][row["episode_index"]]
     return {key: to_numpy(frames[key], tuple(features[key]["shape"])) for key in wrong}
 
 

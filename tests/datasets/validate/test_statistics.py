@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from bhd_lerobot.datasets.assembly import assemble
 from bhd_lerobot.datasets.edit.edits import delete, merge
-from bhd_lerobot.datasets.format.columns import read_episode
+from bhd_lerobot.datasets.format.columns import frames_of, read_episode
 from bhd_lerobot.datasets.format.statistics import are_possible, column_stats
 from bhd_lerobot.datasets.loader.check import check
 from bhd_lerobot.datasets.loader.table_dataset import TableDataset
@@ -180,6 +181,34 @@ def test_no_edit_passes_on_a_deviation_that_cannot_be(tmp_path: Path, change: An
         assert not ((stats["std"] == 0) & (stats["max"] > stats["min"])).any()
         assert are_possible(stats).all()
     np.testing.assert_allclose(stored(root)["std"][:2], true_std(root)[:2], rtol=1.0, atol=1e-6)
+
+
+def test_all_deviations_of_a_file_cost_reading_it_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot puts hundreds of episodes into a file; one in which a number is not finite may be kept."""
+
+    def change(episode: int, values: foreign.Columns) -> None:
+        far_from_zero(episode, values)
+        if episode == 2:
+            values["observation.state"][1, 2] = np.nan
+
+    root = foreign.write(tmp_path / "d", (200,) * 4, change=change, stats_of=partly_rounded)
+    read: list[Path] = []
+
+    def count(path: Path, *arguments: Any) -> Any:
+        read.append(path)
+        return frames_of(path, *arguments)
+
+    monkeypatch.setattr(assemble, "frames_of", count)
+    delete(root, [0])
+    assert len(read) == 1
+    assert len_of(root) == 3
+
+
+def partly_rounded(columns: foreign.Columns) -> dict[str, Any]:
+    """Return statistics with an impossible deviation of the first number, as of an episode with a NaN in another."""
+    stats = column_stats(columns, finite=False)
+    stats["observation.state"]["std"][0] = 0.0
+    return stats
 
 
 @given(arrays(np.float32, st.tuples(st.integers(1, 40), st.just(2)), elements=st.floats(-100, 100, width=32)))
