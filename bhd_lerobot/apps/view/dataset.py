@@ -54,7 +54,7 @@ class ViewedDataset:
     def _read(self) -> _Content:
         info = self.root / layout.INFO
         if info.is_file():
-            RootLock(self.root).release()
+            RootLock(self.root, is_shared=True).release()
         stamp = stamp_of(self.root)
         try:
             state = load_state(self.root, videos=False)  # a missing video is reported in its place on the page

@@ -71,7 +71,7 @@ def _exists(root: Path, remedy: str) -> DatasetError:
         return DatasetExistsError(f"{root} is not a folder, but a file or a broken link. Choose another root.")
     if remedy == _RESUME:
         try:
-            RootLock(root, is_choice=True).release()
+            RootLock(root, is_choice=True, is_shared=True).release()
         except DatasetLockedError as error:
             return error
         except OSError:  # the folder may not be read

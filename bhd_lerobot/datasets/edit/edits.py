@@ -320,19 +320,21 @@ def check_episodes(state: DatasetState, episodes: Sequence[int]) -> None:
 
 @contextlib.contextmanager
 def opened(roots: Sequence[Path]) -> Iterator[list[DatasetState]]:
-    """Lock datasets and read their state."""
+    """Read the state of datasets, which others may read, too, and nobody writes meanwhile."""
     with contextlib.ExitStack() as stack:
         for root in roots:
-            stack.callback(_lock(root).release)
+            stack.callback(_lock(root, is_shared=True).release)
         yield [_state_of(root) for root in roots]
 
 
-def _lock(root: Path) -> RootLock:
+def _lock(root: Path, *, is_shared: bool = False) -> RootLock:
     if not root.is_dir():
         raise no_dataset(root)
     complete_interrupted(root)
-    lock = RootLock(root)
-    clean(root)
+    remove_abandoned(real(root))
+    lock = RootLock(root, is_shared=is_shared)
+    if not is_shared:
+        clean(root)
     return lock
 
 

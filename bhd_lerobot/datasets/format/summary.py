@@ -101,7 +101,7 @@ def dataset_info(root: Path | str) -> DatasetSummary:
 def is_being_written(root: Path) -> bool:
     """Return whether a dataset is being recorded, repaired or edited by us at this moment."""
     try:
-        RootLock(root).release()
+        RootLock(root, is_shared=True).release()
     except DatasetLockedError:
         return True
     except OSError:  # it is missing or may not be read

@@ -46,10 +46,10 @@ def open_local(root: Path) -> Iterator[LocalDataset]:
         raise DatasetError(f"{root} is not a LeRobot dataset: it does not exist.")
     try:
         complete_interrupted(root)
-        lock = RootLock(root)
+        lock = RootLock(root, is_shared=True)
     except DatasetLockedError as error:
         raise DatasetLockedError(
-            f"{root} is in use: it is being recorded, repaired or copied by another process. Wait until that ends."
+            f"{root} is in use: it is being recorded, repaired or edited by another process. Wait until that ends."
         ) from error
     with contextlib.closing(lock):
         stamps = _stamps(root)

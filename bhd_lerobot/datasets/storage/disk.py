@@ -193,13 +193,22 @@ def write_errors(action: str, root: Path, consequence: str) -> Iterator[None]:
 
 
 class RootLock:
-    """Exclusive ownership of a dataset root, held until `release` or the end of the process.
+    """Ownership of a dataset root, held until `release` or the end of the process.
 
     The lock is taken on the folder itself, so no lock file is left behind for an upload to pick up.
+
+    Args:
+        root: the folder.
+        shown_as: the place that it will have.
+        is_choice: whether another root may be chosen.
+        is_shared: whether others may read it at the same time, and nobody writes; else it is of this process alone.
     """
 
-    def __init__(self, root: Path, shown_as: Path | None = None, *, is_choice: bool = False) -> None:
+    def __init__(
+        self, root: Path, shown_as: Path | None = None, *, is_choice: bool = False, is_shared: bool = False
+    ) -> None:
         self._root, self._shown_as, self._is_choice = root, shown_as or root, is_choice
+        self._kind = fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX
         self._handle: int | None = None
         self.acquire()
 
@@ -209,11 +218,11 @@ class RootLock:
             return False
         handle = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, self._kind | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
             raise DatasetLockedError(
-                f"{self._shown_as} is being recorded, repaired or edited by another process. Wait until it ends"
+                f"{self._shown_as} is being recorded, repaired, edited or copied by another process. Wait until it ends"
                 f"{', or choose another root' if self._is_choice else ''}."
             ) from None
         self._handle = handle

@@ -37,7 +37,7 @@ def test_a_dataset_that_changes_is_noticed_and_read_again(tmp_path) -> None:
         with closing(RootLock(root)):
             status, content = server.mark(0, {"outcome": "success"})
         assert status == 409
-        assert "being recorded, repaired or edited" in content.decode()
+        assert "being recorded, repaired, edited" in content.decode()
 
 
 def test_a_page_that_shows_what_another_page_has_loaded_again_is_refused(tmp_path) -> None:
@@ -57,7 +57,7 @@ def test_a_page_that_shows_what_another_page_has_loaded_again_is_refused(tmp_pat
 def test_damaged_missing_and_locked_datasets_are_refused(base, tmp_path) -> None:
     with pytest.raises(DatasetError, match="does not exist"):
         ViewedDataset(tmp_path / "none")
-    with closing(RootLock(base)), pytest.raises(DatasetLockedError, match="being recorded, repaired or edited"):
+    with closing(RootLock(base)), pytest.raises(DatasetLockedError, match="being recorded, repaired, edited"):
         ViewedDataset(base)
     root = Path(shutil.copytree(base, tmp_path / "d"))
     path = next((root / "data").rglob("*.parquet"))

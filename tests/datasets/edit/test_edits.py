@@ -10,10 +10,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep, merge, split
+from bhd_lerobot.datasets.edit.edits import delete, edits_of, keep, merge, opened, split
 from bhd_lerobot.datasets.edit.mark import mark
-from bhd_lerobot.datasets.format.summary import dataset_info
+from bhd_lerobot.datasets.format.summary import dataset_info, is_being_written
 from bhd_lerobot.datasets.recovery.fix import fix
+from bhd_lerobot.datasets.recovery.repair import repair
+from bhd_lerobot.datasets.remote.local import open_local
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.validate.dataset import check_dataset
@@ -232,6 +234,20 @@ def test_bad_requests(plain: Path, tmp_path: Path) -> None:
             action()
     assert content(root) == before
     assert not (tmp_path / "x").exists()
+
+
+def test_several_read_a_dataset_at_once_and_nobody_writes_it_meanwhile(plain: Path, tmp_path: Path) -> None:
+    root, other = Path(shutil.copytree(plain, tmp_path / "d")), record(tmp_path / "other", [7])
+    with opened([root]):
+        keep(root, [0], tmp_path / "kept")
+        merge([root, other], tmp_path / "all")
+        with open_local(root):
+            assert not is_being_written(root)
+        for write in (lambda: delete(root, [0]), lambda: support.resume(root), lambda: repair(root)):
+            with pytest.raises(DatasetLockedError, match="edited or copied by another process"):
+                write()
+    delete(root, [0])
+    assert content(root) == content(plain)[1:]
 
 
 def test_a_dataset_that_is_being_recorded_is_refused(tmp_path: Path) -> None:

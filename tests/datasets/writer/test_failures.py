@@ -169,7 +169,7 @@ def test_only_one_writer_at_a_time(tmp_path: Path) -> None:
     support.record(recorder)
     files = os.listdir("/proc/self/fd")
     for call in (support.create, support.resume, repair):
-        with pytest.raises(DatasetLockedError, match="is being recorded, repaired or edited by another process"):
+        with pytest.raises(DatasetLockedError, match="is being recorded, repaired, edited or copied"):
             call(root)
     assert len(os.listdir("/proc/self/fd")) == len(files)
     recorder.finalize()
