@@ -5,13 +5,18 @@ own are as a user has them.
 """
 
 import functools
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 
 def install() -> None:
-    """Let libraries that are imported do each thing once that they do for each column and for each option."""
+    """Let libraries that are imported do each thing once that they do for each column and for each option.
+
+    Nothing is flushed to the device: no test cuts the power, and each time costs milliseconds.
+    """
+    os.fsync = lambda fd: None
     features = sys.modules.get("datasets.features.features")
     if features is not None:
         # Each of some 270 columns of a dataset's episodes that is set computes this of all columns again.
