@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bhd_lerobot.control.commands import Command, CommandResult
+from bhd_lerobot.control.commands import Chunk, Command, CommandResult
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.manipulation.goal_brain import GoalBrain
@@ -36,6 +36,7 @@ class TakeoverBrain(Brain):
         self.uses_images, self.uses_privileged_state = brain.uses_images, brain.uses_privileged_state
         self._was_taken = self._is_settled = False
         self._start: tuple[Any, ...] = ()
+        self._left: list[NDArray[np.float64]] = []  # of the brain's last chunk, from the action that is in force
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot both drive."""
@@ -46,6 +47,7 @@ class TakeoverBrain(Brain):
         """Start an episode."""
         self._start = ids, seeds, n, instructions
         self._was_taken = self._is_settled = False
+        self._left = []
         self._brain.reset(*self._start)
         self._person.reset(*self._start)
 
@@ -68,10 +70,21 @@ class TakeoverBrain(Brain):
         return driver.needs_images(results)
 
     def act(self, observation: Observation) -> Command:
-        """Return the action of the one who drives."""
+        """Return the action of the one who drives.
+
+        While a person who has taken over gives none yet, the brain's last one stays, without the rest of its chunk.
+        """
         is_taken = self._settle()
         self._is_settled = False
-        return self._person.act(observation) if is_taken else self._brain.act(observation)
+        if is_taken:
+            command = self._person.act(observation)
+            if command is None and len(self._left) > 1:
+                command = self._left[0]
+            self._left = []
+            return command
+        command = self._brain.act(observation)
+        self._left = list(command.actions) if isinstance(command, Chunk) else self._left[1:]
+        return command
 
     def subtasks(self) -> Sequence[str]:
         """Return what the brain is doing."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bhd_lerobot.control.commands import Chunk
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
@@ -76,6 +77,35 @@ def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afres
     assert both.parameters() == {"type": "policy", "takeover": {"type": "teleop"}}
     both.close()
     assert person.closed
+
+
+class Streaming(Counting):
+    """Gives a chunk of five actions in its first frame."""
+
+    def act(self, observation: Observation) -> Any:
+        first = super().act(observation) if self._count == 0 else None
+        return None if first is None else Chunk(first + np.arange(5.0)[:, None, None])
+
+
+class Silent(Counting):
+    """Gives an action in its third frame, and none before."""
+
+    def act(self, observation: Observation) -> Any:
+        action = super().act(observation)
+        return action if self._count > 2 else None
+
+
+@pytest.mark.law
+def test_who_takes_over_and_does_nothing_yet_ends_what_a_chunk_would_go_on_with() -> None:
+    brain, person, frames = Streaming("policy", 0.0), Silent("teleop", 100.0), iter(range(99))
+    both: Any = TakeoverBrain(brain, person, lambda: 2 <= next(frames) < 6)  # type: ignore[arg-type]
+    both.bind(RobotFeatures(("a.pos",), ("a.pos",), 10))
+    both.reset(np.zeros(1, np.intp), [0], 1)
+    commands = [both.act(SEEN) for _ in range(8)]
+    given = [None if one is None or isinstance(one, Chunk) else float(one[0, 0]) for one in commands]
+    # In the second frame the chunk's second action was in force.
+    assert given == [None, None, 2.0, None, 103.0, 104.0, None, None]
+    assert [isinstance(one, Chunk) for one in commands] == [True] + [False] * 5 + [True, False]
 
 
 @pytest.mark.law
