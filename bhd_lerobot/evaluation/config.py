@@ -11,7 +11,7 @@ from bhd_lerobot.options.declared import Count, OneOf, Options, Range, Share, Wh
 from bhd_lerobot.policies.brain import BrainConfig
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
-from bhd_lerobot.robots.viewer.viewer import check_view
+from bhd_lerobot.robots.host.config import check_view
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig
 

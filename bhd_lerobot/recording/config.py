@@ -16,7 +16,7 @@ from bhd_lerobot.realtime.estop import estop_signal
 from bhd_lerobot.recording.live_view import PACKAGES, check_display
 from bhd_lerobot.registry import check_brain, check_robot_and_task, is_ours
 from bhd_lerobot.robots.external.config import FPS, GateConfig
-from bhd_lerobot.robots.viewer.viewer import check_view
+from bhd_lerobot.robots.host.config import check_view
 from bhd_lerobot.rollout.tolerance import TimingTolerance
 from bhd_lerobot.tasks.free import FreeConfig
 from bhd_lerobot.tasks.task import SPLITS, TaskConfig

@@ -1,8 +1,9 @@
 """Options of a robot on the wall clock."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Count, Options, Positive
 from bhd_lerobot.realtime.loop import LoopLimits
 from bhd_lerobot.realtime.privileges import RealtimeSettings
@@ -69,3 +70,18 @@ class RealtimeConfig(Options, prefix="robot.realtime."):
             most_misses=self.most_misses,
             most_catch_up=self.most_catch_up,
         )
+
+
+def check_view(view: bool, robot: Any) -> None:
+    """Refuse to show what is not simulated.
+
+    Args:
+        view: the option.
+        robot: the robot's configuration.
+
+    Raises:
+        ConfigError: names what shows the robot instead.
+    """
+    if view and (not hasattr(robot, "plant") or robot.plant):
+        instead = "; bhd-monitor --3d shows it in a browser" if hasattr(robot, "plant") else ""
+        raise ConfigError(f"--view=true shows a simulation, and {robot.type!r} is not simulated here{instead}.")

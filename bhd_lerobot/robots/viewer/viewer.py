@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.scenes import scene_to_json
-from bhd_lerobot.errors import ConfigError, RenderingError
+from bhd_lerobot.errors import RenderingError
 from bhd_lerobot.programs import start_program
 from bhd_lerobot.realtime.block import LiveBlock, LiveLayout
 from bhd_lerobot.robots.host.process import LiveSpec
@@ -27,21 +27,6 @@ from bhd_lerobot.sim.window import require_display
 _OPEN_S = 60.0  # that a window may take
 _STATES = 4  # that can still be read; the newest is shown
 _numbers = itertools.count()
-
-
-def check_view(view: bool, robot: Any) -> None:
-    """Refuse to show what is not simulated.
-
-    Args:
-        view: the option.
-        robot: the robot's configuration.
-
-    Raises:
-        ConfigError: names what shows the robot instead.
-    """
-    if view and (not hasattr(robot, "plant") or robot.plant):
-        instead = "; bhd-monitor --3d shows it in a browser" if hasattr(robot, "plant") else ""
-        raise ConfigError(f"--view=true shows a simulation, and {robot.type!r} is not simulated here{instead}.")
 
 
 def prepare_view(view: bool) -> None:
