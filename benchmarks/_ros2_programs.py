@@ -12,34 +12,34 @@ from typing import Any
 from rich.console import Console
 
 from bhd_lerobot.control.fifo import RingReader
-from bhd_lerobot.registry import robot_configs
-from bhd_lerobot.robots.robot import BhdRobot
+from bhd_lerobot.registry import ROBOTS, robot_configs
 from bhd_lerobot.robots.turtlebot3 import TurtleBot3
 from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 from bhd_lerobot.ros2.messages.parts import header_stamps
 from bhd_lerobot.ros2.serve import serve as served
-from bhd_lerobot.ros2.serve.base import BaseTopics
-from bhd_lerobot.stock import make_robot_from_config
+from bhd_lerobot.ros2.serve.config import ServeConfig
+from bhd_lerobot.ros2.serve.setpoints import Setpoints
 
 
-class TimedTopics(BaseTopics):
-    """The topics of a base, which notes when commands were sent, accepted, and used by a control tick [ns]."""
+class TimedSetpoints(Setpoints):
+    """Twists to a base, and when they were sent, accepted, and used by a control tick [ns]."""
 
-    made: "TimedTopics"
+    made: "TimedSetpoints"
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        TimedTopics.made = self
+        TimedSetpoints.made = self
         self.sent: list[int] = []
         self.accepted: list[int] = []
         self.used: list[int] = []
         self._ring = RingReader(self._host.link.block.ring)
         self._setpoints = 0
 
-    def _drive_by(self, message: Any) -> None:
-        super()._drive_by(message)
+    def _drive(self, message: Any) -> bool:
+        is_accepted = super()._drive(message)
         self.sent += header_stamps([message]).tolist()
         self.accepted.append(time.time_ns())
+        return is_accepted
 
     def poll(self, now_ns: int) -> int:
         """Look for ticks that took a setpoint."""
@@ -65,16 +65,14 @@ class TimedTopics(BaseTopics):
 def serve(options: argparse.Namespace) -> None:
     """Serve a robot; with `times`, note when commands are used."""
     kind: Any = robot_configs()[options.robot]
-    config = served.ServeConfig(
+    config = ServeConfig(
         kind(id=f"bench-{os.getpid()}"), NetworkConfig(domain=options.domain), joint_states_hz=options.hz
     )
     if options.times:
-        served.BaseTopics = TimedTopics  # type: ignore[misc, assignment]
-    robot: Any = make_robot_from_config(config.robot)
-    assert isinstance(robot, BhdRobot)
-    served.serve(config, robot, Console(stderr=True))
+        served.Setpoints = TimedSetpoints  # type: ignore[misc, assignment]
+    served.serve(config, ROBOTS.of(config.robot), Console(stderr=True))
     if options.times:
-        TimedTopics.made.write(options.times)
+        TimedSetpoints.made.write(options.times)
 
 
 def drive(options: argparse.Namespace) -> None:

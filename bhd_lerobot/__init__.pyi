@@ -61,7 +61,7 @@ from bhd_lerobot.robots.config_ur import UR5Config as UR5Config
 from bhd_lerobot.robots.conformance import check_robot as check_robot
 from bhd_lerobot.robots.host.config import RealtimeConfig as RealtimeConfig
 from bhd_lerobot.robots.ur import UR5 as UR5
-from bhd_lerobot.rollout.replay import ReplayConfig as ReplayConfig
+from bhd_lerobot.rollout.replay.config import ReplayConfig as ReplayConfig
 from bhd_lerobot.tasks.task import ArmTask as ArmTask
 from bhd_lerobot.tasks.task import BaseTask as BaseTask
 from bhd_lerobot.tasks.task import Event as Event

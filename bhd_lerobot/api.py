@@ -24,8 +24,9 @@ from bhd_lerobot.policies.brain import Brain, BrainConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record as run_record
 from bhd_lerobot.recording.report import RecordResult
-from bhd_lerobot.rollout.replay import Divergence, ReplayConfig
-from bhd_lerobot.rollout.replay import replay as run_replay
+from bhd_lerobot.rollout.replay.config import ReplayConfig
+from bhd_lerobot.rollout.replay.simulated import Divergence
+from bhd_lerobot.rollout.replay.simulated import replay as run_replay
 from bhd_lerobot.stock import make_robot_from_config
 from bhd_lerobot.tasks.task import Task, TaskConfig
 

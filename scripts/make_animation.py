@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.rollout.preview import Preview
-from bhd_lerobot.rollout.replay import Replay
+from bhd_lerobot.rollout.replay.simulated import Replay
 
 MOST_BYTES = 2_000_000
 BAR, MARGIN, SIZE = 34, 12, 15  # of the caption [px]

@@ -36,9 +36,8 @@ from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.parts.names import drive_observation_names
 from bhd_lerobot.robots.ur import UR5
-from bhd_lerobot.rollout.replay import ReplayConfig
-from bhd_lerobot.ros2.serve.bridge import BridgeConfig
-from bhd_lerobot.ros2.serve.serve import ServeConfig
+from bhd_lerobot.rollout.replay.config import ReplayConfig
+from bhd_lerobot.ros2.serve.config import BridgeConfig, ServeConfig
 from bhd_lerobot.tasks import avoid, navigate, pick, reach
 from bhd_lerobot.tasks.task import Event
 from bhd_lerobot.training.config import BhdTrainConfig, own_fields

@@ -99,12 +99,14 @@ ARROWS: dict[str, tuple[str, ...]] = {
         *("ros2.messages", "ros2.bag.storage"),
     ),
     "rollout": (
-        "realtime",
-        *("__version__", "options", "registry"),
-        *("tasks", "bodies", "sim", "control", "robots.*", "policies.*"),
-        *(*_DATASETS, "datasets.writer"),
+        *("__version__", "options", "tasks", "bodies", "sim", "control", "realtime", "policies"),
+        *("robots.host", "robots.external", *_DATASETS, "datasets.writer"),
     ),
-    "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout"),
+    "rollout.replay": (
+        *("options", "registry", "bodies", "control", "realtime", "robots.host", "robots.external"),
+        *(*_DATASETS, "rollout"),
+    ),
+    "hub": ("bodies", *_DATASETS, "datasets.remote", "rollout", "rollout.replay"),
     "cluster": ("registry", "tasks", "control", "robots.host", "policies.*", "datasets.format", "rollout"),
     "recording": (
         *("options", "registry", "tasks", "bodies", "control", "realtime"),
@@ -145,7 +147,8 @@ ARROWS: dict[str, tuple[str, ...]] = {
         "control.geometry",
     ),
     "api": (
-        *("options", "registry", "tasks", "policies", "rollout", "recording", "evaluation", "training", "training.rl"),
+        *("options", "registry", "tasks", "policies", "rollout.replay", "recording", "evaluation"),
+        *("training", "training.rl"),
     ),
     "cli": EVERYTHING,
     "cli.data": EVERYTHING,

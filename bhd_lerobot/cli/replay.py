@@ -3,17 +3,23 @@
 import sys
 from collections.abc import Sequence
 
-from rich.console import Console
-
+from bhd_lerobot.cli.start import loading
 from bhd_lerobot.options.command import Program, run
-from bhd_lerobot.rollout.replay import ReplayConfig, replay, root_of
-from bhd_lerobot.rollout.replay_robot import replay_on_robot
+from bhd_lerobot.rollout.replay.config import ReplayConfig, root_of
 
 
 def _replay(config: ReplayConfig) -> int:
     if config.robot is not None:
+        with loading():
+            from rich.console import Console
+
+            from bhd_lerobot.rollout.replay.on_robot import replay_on_robot
+
         replay_on_robot(root_of(config), config.dataset.episode, config.robot, config.gate, Console(stderr=True))
         return 0
+    with loading():
+        from bhd_lerobot.rollout.replay.simulated import replay
+
     worst = max(float(result.position_m.max()) for result in replay(config))
     return int(config.tolerance_m is not None and not worst <= config.tolerance_m)  # what is not a number is not
 

@@ -3,19 +3,27 @@
 import sys
 from collections.abc import Sequence
 
-from rich.console import Console
-
+from bhd_lerobot.cli.start import loading
 from bhd_lerobot.options.command import Program, run
 from bhd_lerobot.registry import ROBOTS
-from bhd_lerobot.ros2.serve.bridge import BridgeConfig, bridge
-from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
+from bhd_lerobot.ros2.serve.config import BridgeConfig, ServeConfig
 
 
 def _serve(config: ServeConfig) -> None:
+    with loading():
+        from rich.console import Console
+
+        from bhd_lerobot.ros2.serve.serve import serve
+
     serve(config, ROBOTS.of(config.robot), Console(stderr=True))
 
 
 def _bridge(config: BridgeConfig) -> None:
+    with loading():
+        from rich.console import Console
+
+        from bhd_lerobot.ros2.serve.bridge import bridge
+
     bridge(config, ROBOTS.of(config.robot), Console(stderr=True))
 
 

@@ -12,13 +12,19 @@ from bhd_lerobot.options.parse import CommandLine
 
 
 def algorithm_of(line: CommandLine) -> Any:
-    """Return what a command line sets as `algorithm`, itself or in its file; None for learning from a dataset."""
-    if "algorithm" in line.options:
-        return line.options["algorithm"]
+    """Return what a command line sets as `algorithm`, itself or in its file; None for learning from a dataset.
+
+    Raises:
+        ConfigError: there is no such file; said before what learns is imported, which takes seconds.
+    """
+    if "algorithm" in line.options or line.path is None:
+        return line.options.get("algorithm")
     try:
-        return None if line.path is None or line.path.suffix == ".json" else line.file.get("algorithm")
-    except ConfigError:  # a checkpoint's folder, or what is left to the parser that reads it next
-        return None
+        return line.file.get("algorithm")
+    except ConfigError:
+        if line.options.get("resume") is not True:
+            raise
+        return None  # a checkpoint's folder, or none, which is said where it is looked for
 
 
 def _program(line: CommandLine) -> Program:

@@ -58,7 +58,7 @@ def _trajectories(summary: DatasetSummary, state: DatasetState) -> tuple[bytes, 
         return None
     from bhd_lerobot.bodies.scenes import scene_from_json
     from bhd_lerobot.rollout.plots import Trajectory, draw_trajectories
-    from bhd_lerobot.rollout.replay import Replay
+    from bhd_lerobot.rollout.replay.simulated import Replay
 
     simulation = Replay(state.root, 0).simulation
     trajectories = []

@@ -7,6 +7,7 @@ __all__ = [
     "frame_reader",
     "grid",
     "keys",
+    "limits",
     "loop",
     "mailbox",
     "planning_link",

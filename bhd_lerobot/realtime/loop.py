@@ -5,7 +5,6 @@ The clock and the sleep are given, so that everything in here runs on a virtual 
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,26 +14,7 @@ from bhd_lerobot.control.kernels import fence
 from bhd_lerobot.control.messages import NANOSECONDS, Mode, Watchdog
 from bhd_lerobot.realtime.block import Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
-
-
-@dataclass(frozen=True)
-class LoopLimits:
-    """When the loop stops the robot by itself.
-
-    Attributes:
-        brain_timeout_s: after so long without a sign of life of the brain's process a robot that moves decelerates and
-            holds [s].
-        plant_timeout_s: a reading of a plant that is older than this is a FAULT [s]; at least three ticks.
-        most_misses: after so many starts in a row that came a period or more too late, FAULT.
-        most_catch_up: so many periods at the most are caught up by one tick; what is beyond is lost to the simulation,
-            which then is behind, and counted.
-    """
-
-    brain_timeout_s: float = 0.5
-    plant_timeout_s: float = 0.02
-    most_misses: int = 10
-    most_catch_up: int = 10
-
+from bhd_lerobot.realtime.limits import LoopLimits
 
 _BRAIN_ALIVE = int(Word.BRAIN_ALIVE)  # a plain number: an index of an enumeration costs a call
 

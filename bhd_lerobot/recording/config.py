@@ -215,3 +215,25 @@ class RecordConfig(Options):
                     "same value."
                 )
             chosen.duration_s = self.dataset.episode_time_s
+
+
+@dataclass
+class PassiveRecordConfig(Options, prefix="record."):
+    """What is recorded of a robot that others command.
+
+    Attributes:
+        root: folder of the dataset, which is continued if it is there; nothing is recorded without one.
+        task: what the robot is to do, the instruction of the episodes.
+        episode_time_s: maximum duration of an episode [s]; the next one begins with the next command.
+        idle_s: an episode ends when no command was followed for so long [s].
+    """
+
+    root: str = ""
+    task: str = "Follow the commands of the brain."
+    episode_time_s: Positive = 60.0
+    idle_s: Positive = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.task:
+            raise ConfigError("record.task is empty; it is a sentence, the instruction of the episodes.")

@@ -10,7 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,9 @@ from rich.markup import escape
 from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.robots.host.robots import Robots
+
+if TYPE_CHECKING:
+    from bhd_lerobot.robots.host.robots import Robots
 
 PACKAGES = {"rerun": ("rerun-sdk", "rerun"), "foxglove": ("foxglove-sdk", "foxglove")}
 """What each `display_mode` needs: the package, and the module in it."""
@@ -83,7 +85,7 @@ class LiveView:
         problem: why nothing is shown any more, or an empty text.
     """
 
-    def __init__(self, options: DisplayOptions, robots: Robots) -> None:
+    def __init__(self, options: DisplayOptions, robots: "Robots") -> None:
         check_display(options)
         self.shown = self.left_out = 0
         self.problem = ""
@@ -281,7 +283,7 @@ def points(scan: NDArray[Any], range_max: float) -> NDArray[np.float64]:
 
 
 @contextmanager
-def live_view(options: DisplayOptions, robots: Robots, console: Console) -> Iterator[LiveView | None]:
+def live_view(options: DisplayOptions, robots: "Robots", console: Console) -> Iterator[LiveView | None]:
     """Show a run live if `display_data` is set; at its end print how many frames were left out."""
     if not options.display_data:
         yield None

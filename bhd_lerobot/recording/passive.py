@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,9 +14,9 @@ from bhd_lerobot.control.commands import Command, CommandResult
 from bhd_lerobot.datasets.format.identity import local_name
 from bhd_lerobot.datasets.storage.atomic import is_free
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
-from bhd_lerobot.errors import BhdError, ConfigError, as_text
-from bhd_lerobot.options.declared import Options, Positive
+from bhd_lerobot.errors import BhdError, as_text
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
+from bhd_lerobot.recording.config import PassiveRecordConfig
 from bhd_lerobot.recording.onlooker import Onlooker
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.realtime import LiveHost
@@ -27,28 +26,6 @@ from bhd_lerobot.rollout.recorder import Recording, closing_used, open_recorder,
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.free import FreeConfig, FreeTask
 from bhd_lerobot.tasks.task import Event, episode_seed
-
-
-@dataclass
-class RecordOptions(Options, prefix="record."):
-    """What is recorded of a robot that others command.
-
-    Attributes:
-        root: folder of the dataset, which is continued if it is there; nothing is recorded without one.
-        task: what the robot is to do, the instruction of the episodes.
-        episode_time_s: maximum duration of an episode [s]; the next one begins with the next command.
-        idle_s: an episode ends when no command was followed for so long [s].
-    """
-
-    root: str = ""
-    task: str = "Follow the commands of the brain."
-    episode_time_s: Positive = 60.0
-    idle_s: Positive = 2.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.task:
-            raise ConfigError("record.task is empty; it is a sentence, the instruction of the episodes.")
 
 
 class _Commanded(FreeTask):
@@ -96,7 +73,7 @@ class PassiveRecording:
     """
 
     def __init__(
-        self, options: RecordOptions, mirror: Host, report: Callable[[str], None], ended: threading.Event
+        self, options: PassiveRecordConfig, mirror: Host, report: Callable[[str], None], ended: threading.Event
     ) -> None:
         self._report, self._ended, self._is_lost = report, ended, False
         self._onlooker = Onlooker(mirror, options.idle_s, self._ending)

@@ -11,7 +11,6 @@ __all__ = [
     "provenance",
     "recorder",
     "replay",
-    "replay_robot",
     "run_folder",
     "signals",
     "tolerance",

@@ -22,9 +22,8 @@ from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.parse import CommandLine, parse, read_line
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.recording.record import record
-from bhd_lerobot.rollout.replay import ReplayConfig
-from bhd_lerobot.ros2.serve.bridge import BridgeConfig
-from bhd_lerobot.ros2.serve.serve import ServeConfig
+from bhd_lerobot.rollout.replay.config import ReplayConfig
+from bhd_lerobot.ros2.serve.config import BridgeConfig, ServeConfig
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.dagger.config import parse_aggregation, read_stages
 from bhd_lerobot.training.rl.config import parse_rl

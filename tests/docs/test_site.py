@@ -12,7 +12,7 @@ from mkdocs.config import load_config
 import bhd_lerobot as bhd
 from bhd_lerobot.evaluation.evaluate import EvalResult
 from bhd_lerobot.recording.report import RecordResult
-from bhd_lerobot.rollout.replay import Divergence
+from bhd_lerobot.rollout.replay.simulated import Divergence
 from bhd_lerobot.training.rl.train import RlResult
 from bhd_lerobot.training.train import TrainResult
 from tests.docs.support import ROOT

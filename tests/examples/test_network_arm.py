@@ -21,7 +21,7 @@ from bhd_lerobot.datasets.format.summary import dataset_info
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.errors import DatasetError, RealtimeError
 from bhd_lerobot.realtime.block import LiveBlock, Word
-from bhd_lerobot.rollout.replay import Replay
+from bhd_lerobot.rollout.replay.simulated import Replay
 from tests.forks import Fork
 from tests.waiting import until
 

@@ -15,9 +15,8 @@ from bhd_lerobot.evaluation.environment import EnvironmentEvalConfig
 from bhd_lerobot.options.declared import OneOf, Options, Range, check_option, declaration_of, declared_types
 from bhd_lerobot.options.parse import choices_of, decode, entries_of, options_of
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.replay import ReplayConfig
-from bhd_lerobot.ros2.serve.bridge import BridgeConfig
-from bhd_lerobot.ros2.serve.serve import ServeConfig
+from bhd_lerobot.rollout.replay.config import ReplayConfig
+from bhd_lerobot.ros2.serve.config import BridgeConfig, ServeConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.dagger.config import AggregationConfig
 from bhd_lerobot.training.rl.config import RlConfig

@@ -9,9 +9,8 @@ from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.help import help_of
 from bhd_lerobot.options.plugins import load_lerobot
 from bhd_lerobot.recording.config import RecordConfig
-from bhd_lerobot.rollout.replay import ReplayConfig
-from bhd_lerobot.ros2.serve.bridge import BridgeConfig
-from bhd_lerobot.ros2.serve.serve import ServeConfig
+from bhd_lerobot.rollout.replay.config import ReplayConfig
+from bhd_lerobot.ros2.serve.config import BridgeConfig, ServeConfig
 from bhd_lerobot.training.config import BhdTrainConfig
 from bhd_lerobot.training.rl.config import RlConfig
 

@@ -12,7 +12,8 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, Reason, Request, Wat
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.realtime.block import WORDS, Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from bhd_lerobot.realtime.limits import LoopLimits
+from bhd_lerobot.realtime.loop import RealtimeLoop
 from tests.control.support import TICK_NS, Rig
 
 MS = 1_000_000

@@ -22,7 +22,7 @@ from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.rollout.drivers import DriverLog, Intervention, flagged
 from bhd_lerobot.rollout.episode import EpisodeLoop
-from bhd_lerobot.rollout.replay import Replay
+from bhd_lerobot.rollout.replay.simulated import Replay
 from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig
 from bhd_lerobot.tasks.pick import PickConfig

@@ -8,7 +8,7 @@ import pytest
 
 from bhd_lerobot.bodies.scenes import scene_from_json
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.rollout.replay import Replay
+from bhd_lerobot.rollout.replay.simulated import Replay
 from tests.recording.support import data_columns, episode_rows, run_record
 
 PICK = {

@@ -10,7 +10,7 @@ from bhd_lerobot.cli.replay import main
 from bhd_lerobot.datasets.edit.edits import delete, merge
 from bhd_lerobot.errors import DatasetError
 from bhd_lerobot.policies.manipulation.reach import ReachBrain
-from bhd_lerobot.rollout.replay import Replay
+from bhd_lerobot.rollout.replay.simulated import Replay
 from tests.cases import each_case
 from tests.recording.support import run_record
 

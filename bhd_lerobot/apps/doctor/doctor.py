@@ -129,7 +129,7 @@ def examine_and_print(options: argparse.Namespace, run: RunTrials) -> int:
             measured = tested.value
         findings = examine(root, run)
         if options.realtime:
-            from bhd_lerobot.realtime.loop import LoopLimits
+            from bhd_lerobot.realtime.limits import LoopLimits
 
             findings += checks.check_latency(tested, robot_rates(), LoopLimits().plant_timeout_s)
     if options.json:

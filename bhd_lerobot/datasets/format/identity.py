@@ -4,11 +4,13 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from bhd_lerobot.datasets.format.schema import Schema
-from bhd_lerobot.datasets.format.state import DatasetState
 from bhd_lerobot.errors import ConfigError, DatasetMismatchError
+
+if TYPE_CHECKING:  # configurations import this module, and have no need of Arrow
+    from bhd_lerobot.datasets.format.schema import Schema
+    from bhd_lerobot.datasets.format.state import DatasetState
 
 FORMAT = 1
 """Version of ``meta/bhd.json``."""
@@ -24,9 +26,9 @@ def as_json(recording: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_identity(
-    state: DatasetState,
+    state: "DatasetState",
     *,
-    schema: Schema,
+    schema: "Schema",
     fps: int,
     robot_type: str,
     recording: Mapping[str, Any] | None,

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.options.declared import Count, Options, Positive
-from bhd_lerobot.realtime.loop import LoopLimits
+from bhd_lerobot.realtime.limits import LoopLimits
 from bhd_lerobot.realtime.privileges import RealtimeSettings
 
 CLOCKS = ("lockstep", "realtime")

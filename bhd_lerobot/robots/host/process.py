@@ -29,7 +29,8 @@ from bhd_lerobot.control.messages import NANOSECONDS, Mode, Request, Watchdog
 from bhd_lerobot.errors import BhdError
 from bhd_lerobot.realtime.block import LiveBlock, Phase, Word
 from bhd_lerobot.realtime.grid import Slot, TickGrid
-from bhd_lerobot.realtime.loop import LoopLimits, RealtimeLoop
+from bhd_lerobot.realtime.limits import LoopLimits
+from bhd_lerobot.realtime.loop import RealtimeLoop
 from bhd_lerobot.realtime.privileges import Privileges, RealtimeSettings
 from bhd_lerobot.realtime.requests import RequestServer
 from bhd_lerobot.realtime.timing import TimingStatistics

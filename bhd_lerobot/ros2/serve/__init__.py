@@ -5,6 +5,7 @@ __all__ = [
     "articles",
     "base",
     "bridge",
+    "config",
     "description",
     "extras",
     "foxglove",
@@ -13,7 +14,6 @@ __all__ = [
     "paths",
     "serve",
     "server",
-    "service",
     "setpoints",
     "trajectory",
 ]

@@ -23,7 +23,6 @@ from bhd_lerobot.ros2.messages.table import JOINTS
 from bhd_lerobot.ros2.serve.server import NEVER_NS, Counts, Input, Output, State, Topics
 from bhd_lerobot.ros2.serve.trajectory import JointTrajectory
 
-JOINT_STATES_HZ = 125  # of a UR5 (CB3); a UR5e has 500
 _TRANSFORMS_HZ = 50
 _SPEED_SCALING_HZ = 100
 _REACHED = 1e-3  # [rad], and of the gripper [m]

@@ -3,79 +3,29 @@
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, fields
-from typing import Annotated, Any
+from typing import Any
 
 from rich.console import Console
 
 from bhd_lerobot.control.messages import Mode, Watchdog
-from bhd_lerobot.errors import ConfigError, RealtimeError
-from bhd_lerobot.options.declared import OneOf, Options
-from bhd_lerobot.recording.passive import PassiveRecording, RecordOptions
+from bhd_lerobot.errors import RealtimeError
+from bhd_lerobot.recording.passive import PassiveRecording
 from bhd_lerobot.robots.config import ROS2_PLANTS
 from bhd_lerobot.robots.host.realtime import LiveHost, mirror_of
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.host.state import problem_of, raised
-from bhd_lerobot.ros2.live.network import DISTROS, SENSOR_DATA, Domain, NetworkConfig
+from bhd_lerobot.ros2.live.network import SENSOR_DATA
 from bhd_lerobot.ros2.live.node import Node, Subscription
 from bhd_lerobot.ros2.messages.table import ODOMETRY_TYPE
 from bhd_lerobot.ros2.serve import articles
 from bhd_lerobot.ros2.serve.articles import article_names
+from bhd_lerobot.ros2.serve.config import BridgeConfig
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import RESET_TOPIC, InterfaceTopics
-from bhd_lerobot.ros2.serve.server import Counts, Output, State, Topics
-from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
+from bhd_lerobot.ros2.serve.server import Counts, Output, State, Topics, run_service
 from bhd_lerobot.ros2.serve.setpoints import Setpoints
 
 TWIST_TOPIC, POSITION_TOPIC = "/brain/cmd_vel", "/brain/commands"
-
-
-@dataclass(frozen=True)
-class BrainNetworkConfig(Options, prefix="network."):
-    """The network of the brains in front of a bridge. What is not given is that of `robot.ros2`.
-
-    Attributes:
-        domain: number of the ROS domain.
-        interface: network interface or address; ``lo`` is the loopback interface, ``auto`` what Cyclone DDS prefers.
-        peers: addresses of further machines, for networks without multicast.
-        distro: whose interfaces are used where distributions differ: ``jazzy`` (and later) or ``humble``.
-    """
-
-    domain: Domain | None = None
-    interface: str | None = None
-    peers: list[str] | None = None
-    distro: Annotated[str, OneOf(DISTROS)] | None = None
-
-
-@dataclass
-class BridgeConfig(ServiceConfig):
-    """The cerebellum in front of a robot, between it and a brain on a ROS 2 network. Ctrl-C stops the robot.
-
-    Attributes:
-        robot: the robot; `robot.plant` says how it is driven.
-        network: where brains are; an option that is not given is that of `robot.ros2`.
-        namespace: of the bridge's node; topics keep their names, which begin with a slash.
-        record: what is recorded, and where.
-    """
-
-    network: BrainNetworkConfig = field(default_factory=BrainNetworkConfig)  # type: ignore[assignment]
-    record: RecordOptions = field(default_factory=RecordOptions)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        robot: Any = self.robot
-        if not getattr(robot, "plant", ""):
-            raise ConfigError(
-                "robot.plant is not given; a bridge is in front of a robot that a plant drives: turtlebot3 or ur5 with "
-                "--robot.plant=ros2, or with a class, package.module:Class. `bhd-ros2 serve` serves a simulated robot."
-            )
-        if robot.body().drive is not None:
-            robot.odometry = True  # a goal is reached by it
-        elif robot.action_space != "joint":
-            raise ConfigError(f"robot.action_space is {robot.action_space!r}; a bridge takes joint positions: 'joint'.")
-        given = {name: value for name, value in vars(self.network).items() if value is not None}
-        of_robot = {one.name: getattr(robot.ros2, one.name) for one in fields(NetworkConfig)}
-        self.network = NetworkConfig(**of_robot | given)  # type: ignore[assignment]
 
 
 class Faults(Topics):

@@ -1,66 +1,29 @@
 """`bhd-ros2 serve`: a simulated robot with the topics of a real one."""
 
 import threading
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
 
 from rich.console import Console
 
-from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.declared import Range
 from bhd_lerobot.robots.host.realtime import LiveHost
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.robots.viewer.viewer import prepare_view
 from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.robot_views import robot_view
-from bhd_lerobot.ros2.serve.arm import JOINT_STATES_HZ, ArmTopics
+from bhd_lerobot.ros2.serve.arm import ArmTopics
 from bhd_lerobot.ros2.serve.articles import TWIST_TOPIC, TrajectoryController, article_names
 from bhd_lerobot.ros2.serve.base import BaseTopics
+from bhd_lerobot.ros2.serve.config import ServeConfig
 from bhd_lerobot.ros2.serve.description import publish_description
 from bhd_lerobot.ros2.serve.extras import CameraTopics, ClockTopic
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
 from bhd_lerobot.ros2.serve.goals import ArmGoals, BaseGoals, Goals
 from bhd_lerobot.ros2.serve.interface import InterfaceTopics, Names
 from bhd_lerobot.ros2.serve.paths import DrivenPath, PlannedPath
-from bhd_lerobot.ros2.serve.server import Counts, Topics
-from bhd_lerobot.ros2.serve.service import ServiceConfig, run_service
+from bhd_lerobot.ros2.serve.server import Counts, Topics, run_service
 from bhd_lerobot.ros2.serve.setpoints import Setpoints
 from bhd_lerobot.sim.description import parts_of
-
-
-@dataclass
-class ServeConfig(ServiceConfig):
-    """A simulated robot as a ROS 2 robot, on the wall clock. Ctrl-C ends it.
-
-    Attributes:
-        robot: the robot, one that this package simulates.
-        joint_states_hz: how often an arm's ``/joint_states`` is published [Hz].
-        clock: publish ``/clock`` as well.
-        view: show the simulation in MuJoCo's viewer, a window on this machine. Closing the window does not end the
-            robot.
-        foxglove_port: serve all topics to the Foxglove app on this TCP port of this machine; 0: off.
-    """
-
-    joint_states_hz: Annotated[float, Range("(0, 1000]")] = float(JOINT_STATES_HZ)
-    clock: bool = False
-    view: bool = False
-    foxglove_port: Annotated[int, Range("[0, 65535]")] = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        robot: Any = self.robot
-        if not hasattr(robot, "plant") or robot.plant:
-            raise ConfigError(
-                f"robot.type is {robot.type!r}; what can be served is a simulated robot: turtlebot3 or ur5, without "
-                "robot.plant."
-            )
-        robot.clock = "realtime"
-        if robot.body().drive is not None:
-            robot.odometry = robot.imu = True
-        elif robot.action_space != "joint":
-            raise ConfigError("robot.action_space is not 'joint'; a served arm takes joint positions.")
 
 
 def serve(

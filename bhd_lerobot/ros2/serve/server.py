@@ -1,19 +1,31 @@
-"""The loop of a served robot: commands in as they arrive, topics out on fixed grids of time."""
+"""A robot with a node of its own, from the start of its processes to a clean stop.
 
+Commands are taken as they arrive, topics are published on fixed grids of time.
+"""
+
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from bhd_lerobot.control.messages import NANOSECONDS, CerebellumState, Reason, SendResult
 from bhd_lerobot.errors import DatasetError
-from bhd_lerobot.robots.host.realtime import LiveHost
+from bhd_lerobot.robots.host.realtime import LiveHost, make_live
+from bhd_lerobot.robots.host.simulation import Simulation
+from bhd_lerobot.robots.viewer.viewer import viewed
 from bhd_lerobot.ros2.live.graph import UNNAMED
+from bhd_lerobot.ros2.live.network import require_cyclonedds
 from bhd_lerobot.ros2.live.node import Node, Subscription
 from bhd_lerobot.ros2.messages.parts import Frames
+from bhd_lerobot.ros2.serve.config import ServiceConfig
 
 _LONGEST_WAIT_S = 0.02
 _NAMES_NS = 4 * NANOSECONDS  # the name of a node of Fast DDS comes up to a heartbeat of 3 s after its topics
@@ -218,3 +230,59 @@ class Server:
             left = (due - time.monotonic_ns()) / NANOSECONDS
             if left > 0:
                 self._node.wait(min(left, _LONGEST_WAIT_S))
+
+
+def run_service(
+    config: ServiceConfig,
+    simulation: type[Simulation],
+    scene: Any,
+    parts: Callable[[LiveHost, Node, Counts], list[Topics]],
+    *,
+    console: Console,
+    ended: threading.Event | None = None,
+    title: str,
+    name: str = "",
+    node: Callable[..., Node] = Node,
+    view: bool = False,
+) -> Any:
+    """Run a robot and its topics until SIGINT, SIGTERM or SIGHUP; return the robot's last state.
+
+    Args:
+        scene: in which it starts; None: where it is.
+        name: of the node; the robot's type if empty.
+
+    Raises:
+        RealtimeError: a process of the robot could not be started or has ended, or the network cannot be used.
+    """
+    require_cyclonedds()
+    end, robot = ended or threading.Event(), config.robot
+    is_shown = console.is_terminal
+
+    def stop(number: int, _: FrameType | None) -> None:
+        end.set()
+        console.quiet |= is_shown and number == signal.SIGHUP  # the terminal is gone: it takes nothing any more
+
+    with ExitStack() as running:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # as it is by nohup
+                running.callback(signal.signal, number, signal.signal(number, stop))
+        host = running.enter_context(closing(make_live(simulation, robot, robot.id)))
+        running.enter_context(viewed(host, view))
+        host.reset(np.zeros(1, np.intp), [scene], [getattr(robot, "seed", 0)])
+        host.begin()
+        for line in host.notes:
+            console.print(line)
+        made = running.enter_context(node(name or robot.type, config.network, config.namespace))
+        counts = Counts()
+        server = Server(host, made, parts(host, made, counts), counts)
+        where = "this machine" if config.network.is_local else config.network.interface
+        console.print(f"{robot.type} {title}: domain {config.network.domain_number}, {where}. Ctrl-C ends it.")
+        if config.duration_s:
+            timer = threading.Timer(config.duration_s, end.set)
+            timer.daemon = True
+            timer.start()
+            running.callback(timer.cancel)
+        # A log has one line for a message, whatever its length.
+        server.run(end.is_set, lambda line: console.print(line, markup=False, soft_wrap=not console.is_terminal))
+        console.print(f"Ended. Commands refused: {sum(counts.refused.values())}.")
+        return host.bridge.latest.copy()

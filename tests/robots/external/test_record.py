@@ -28,7 +28,7 @@ from bhd_lerobot.recording.report import RecordResult
 from bhd_lerobot.robots.external.config import GateConfig
 from bhd_lerobot.robots.external.lock import RobotLock
 from bhd_lerobot.rollout.progress import FAULT_STATUS
-from bhd_lerobot.rollout.replay_robot import replay_on_robot
+from bhd_lerobot.rollout.replay.on_robot import replay_on_robot
 from tests.forks import Fork
 from tests.recording.support import saved
 from tests.robots.external.mock_devices import MockArm

@@ -16,7 +16,7 @@ from bhd_lerobot.cli import ros2, serve
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.ros2.live.network import NetworkConfig, Ros2Config
 from bhd_lerobot.ros2.live.node import Node
-from bhd_lerobot.ros2.serve.bridge import BrainNetworkConfig, BridgeConfig
+from bhd_lerobot.ros2.serve.config import BrainNetworkConfig, BridgeConfig
 from tests.ros2.peer_env import Peer
 from tests.ros2.programs import Program, Side, log_of
 from tests.ros2.serve.bridges import FORWARD, NEAR, STAND, TWIST, arm, base, drives, twist

@@ -18,8 +18,9 @@ from bhd_lerobot.registry import ROBOTS
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.ros2.live.network import LATCHED, NetworkConfig
 from bhd_lerobot.ros2.messages.serialize import decode, encode
+from bhd_lerobot.ros2.serve.config import ServeConfig
 from bhd_lerobot.ros2.serve.foxglove import FoxgloveServer, MirroredNode
-from bhd_lerobot.ros2.serve.serve import ServeConfig, serve
+from bhd_lerobot.ros2.serve.serve import serve
 from bhd_lerobot.ros2.serve.server import Counts, Input
 from tests.ros2.serve.foxglove_client import Client
 from tests.waiting import until

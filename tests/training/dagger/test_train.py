@@ -13,7 +13,7 @@ import yaml
 
 from bhd_lerobot.cli.train import algorithm_of, main
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.errors import BhdError
+from bhd_lerobot.errors import BhdError, ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.parse import parse, read_line
 from bhd_lerobot.policies.learned.checkpoint import find_checkpoint, weights_digest
@@ -388,7 +388,9 @@ def test_the_algorithm_decides_which_training_is_asked_for(tmp_path: Path) -> No
     assert algorithm_of(read_line(["--config_path=configs/train/ppo_turtlebot3.yaml", "--steps=5"])) == "ppo"
     assert algorithm_of(read_line(["--config_path=configs/train/dagger_turtlebot3_avoid.yaml"])) == "dagger"
     assert algorithm_of(read_line(["--dataset.repo_id=a/b", "--policy.type=bhd_mlp"])) is None
-    assert algorithm_of(read_line([f"--config_path={tmp_path / 'missing.yaml'}"])) is None
+    assert algorithm_of(read_line([f"--config_path={tmp_path}", "--resume=true"])) is None
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        algorithm_of(read_line([f"--config_path={tmp_path / 'missing.yaml'}"]))
     other = tmp_path / "bc.yaml"
     other.write_text(yaml.safe_dump({"dataset": {"repo_id": "a/b"}}))
     assert algorithm_of(read_line([f"--config_path={other}"])) is None

@@ -1,0 +1,7 @@
+"""Replay of recorded episodes, in simulation and on a robot."""
+
+__all__ = [
+    "config",
+    "on_robot",
+    "simulated",
+]
