@@ -44,6 +44,7 @@ class TeleopBrain(Brain):
         self._map: Callable[[Mapping[str, Any]], dict[str, float] | None] = dict
         self._robot: RobotFeatures | None = None
         self._held: dict[str, float] = {}  # actions of a part that the teleoperator gives nothing of
+        self._commanded: dict[str, float] = {}  # when a person takes over
         self._is_starting = True
         self._answered_s = 0.0
         self._wait_s = 0.0
@@ -103,8 +104,20 @@ class TeleopBrain(Brain):
             raise ConfigError(f"n_envs is {n}; a person drives one robot: use --n_envs=1.")
         self._answered_s = time.monotonic()
         self._is_starting = True
+        self._commanded = {}
         if self._calls is not None:
             self._calls.forget()
+
+    def hold(self, action: NDArray[np.float64] | None) -> None:
+        """Hold, of the part that the teleoperator gives nothing of, what is commanded now, and not what is measured.
+
+        A gripper that holds something is measured wider open than it is commanded to be. To be called after `reset`.
+
+        Args:
+            action: shape (1, actions); None if nothing was commanded yet.
+        """
+        if action is not None and self._robot is not None:
+            self._commanded = dict(zip(self._robot.action_names, action[0].tolist(), strict=True))
 
     def act(self, observation: Observation) -> Command:
         """Return what the person does now; None if nothing.
@@ -149,7 +162,8 @@ class TeleopBrain(Brain):
     def _show(self, seen: dict[str, float]) -> None:
         """Take what is observed: what is held at the start, and what the teleoperator starts from."""
         if self._is_starting:
-            self._held = {name: 0.0 if name.endswith(".vel") else seen[name] for name in self._held}
+            now = seen | self._commanded
+            self._held = {name: 0.0 if name.endswith(".vel") else now[name] for name in self._held}
         if isinstance(self.teleop, StartsFromObservation):
             if self._is_starting:
                 self.teleop.start_from(seen, self._robot.body if self._robot else None)

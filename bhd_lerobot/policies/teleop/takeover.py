@@ -1,7 +1,7 @@
 """A brain from which a person takes over, and to which they give back."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ class TakeoverBrain(Brain):
         self.uses_images, self.uses_privileged_state = brain.uses_images, brain.uses_privileged_state
         self._was_taken = self._is_settled = False
         self._start: tuple[Any, ...] = ()
-        self._left: list[NDArray[np.float64]] = []  # of the brain's last chunk, from the action that is in force
+        self._left: list[NDArray[np.float64]] = []  # of the brain: the action that is in force, and its chunk's rest
 
     def bind(self, robot: RobotFeatures) -> None:
         """Learn what robot both drive."""
@@ -59,6 +59,7 @@ class TakeoverBrain(Brain):
         is_taken = self._is_taken()
         if is_taken and not self._was_taken:
             self._person.reset(*self._start)
+            self._person.hold(self._left[0] if self._left else None)
         elif self._was_taken and not is_taken:
             self._brain.reset(*self._start)  # what it planned is of another time
         self._was_taken = is_taken
@@ -83,7 +84,10 @@ class TakeoverBrain(Brain):
             self._left = []
             return command
         command = self._brain.act(observation)
-        self._left = list(command.actions) if isinstance(command, Chunk) else self._left[1:]
+        if isinstance(command, Chunk):
+            self._left = list(command.actions)
+        else:
+            self._left = (self._left[1:] or self._left) if command is None else [cast(Any, command)]
         return command
 
     def subtasks(self) -> Sequence[str]:

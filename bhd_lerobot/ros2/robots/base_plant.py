@@ -27,6 +27,7 @@ _STOP = (0.0, 0.0)
 _NODE_SILENCE_S = 0.5  # of topics at 20 Hz
 _SCAN_SILENCE_S = 1.0  # of scans at 5 Hz
 _FASTER = 2.0  # times the wheels' largest speed, which none is
+_STEP = 0.5  # [rad] that a wheel may have turned beside that: two readings are not exactly as far apart as their stamps
 
 
 class BasePlant(Ros2Plant):
@@ -46,7 +47,10 @@ class BasePlant(Ros2Plant):
         self._beams, self._has_gyro = beams, config.imu
         self._half_track, self._wheel_radius = drive.wheel_separation / 2, drive.wheel_radius
         self._unit, self._fastest = config.ros2.wheel_speeds, _FASTER * drive.max_wheel_speed
-        node_silence = max(_NODE_SILENCE_S, config.ros2.silent_s)
+        node_silence = self._longest_s = max(_NODE_SILENCE_S, config.ros2.silent_s)
+        self._wheels: NDArray[np.float64] | None = None  # as they were read last, and when
+        self._read_ns = 0
+        self._counted_before = np.zeros(2)  # [rad] by wheels, before their driver began to count anew
         twist_type = TWIST_TYPE if config.ros2.distro == "humble" else STAMPED_TWIST
         inputs = [
             InputSpec.of(columns("/joint_states", JOINTS, joint_columns(drive.joints)), SENSOR_DATA, node_silence),
@@ -75,8 +79,8 @@ class BasePlant(Ros2Plant):
 
     def read_parts(self, state: Any, out: PlantReading) -> None:
         """Write the wheels, the scan and the gyroscope into `out`."""
-        wheels = self.numbers(state, 0)
-        out.position[0] = wheels[:2]
+        wheels, measured = self.numbers(state, 0), state["measured_ns"]
+        out.position[0] = self._turned(wheels[:2], int(measured[0]))
         out.velocity[0] = wheels[2:] / (self._wheel_radius if self._unit == "m/s" else 1.0)
         if (fastest := np.abs(out.velocity[0]).max()) > self._fastest:
             raise RealtimeError(
@@ -86,7 +90,19 @@ class BasePlant(Ros2Plant):
         out.sensors[0, : self._beams] = self.numbers(state, 1)
         if self._has_gyro:
             out.sensors[0, self._beams :] = self.numbers(state, 2)
-        measured = state["measured_ns"]
         if out.stamp_ns is not None:
             out.stamp_ns[0] = measured[0]
         out.sensors_ns[0] = measured[1:].min()
+
+    def _turned(self, angles: NDArray[np.float64], measured_ns: int) -> NDArray[np.float64]:
+        """Return how far the wheels have turned [rad], shape (2,), also after their driver began to count anew.
+
+        What they turned in between is not known, and left out.
+        """
+        if self._wheels is None:
+            self._wheels, self._read_ns = angles.copy(), measured_ns
+        step, elapsed_s = angles - self._wheels, (measured_ns - self._read_ns) / 1e9
+        if np.abs(step).max() > self._fastest * np.clip(elapsed_s, 0.0, self._longest_s) + _STEP:
+            self._counted_before -= step
+        self._wheels, self._read_ns = angles.copy(), measured_ns
+        return angles + self._counted_before

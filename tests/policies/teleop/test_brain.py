@@ -92,6 +92,9 @@ def test_of_an_arm_on_a_base_the_part_that_a_teleoperator_does_not_give_is_held(
         brain.bind(RobotFeatures(names, names, 25, body=body, robot_type=body.name))
         brain.reset(ONLY, [0], 1)
         actions = [brain.act(replace(seen, state=seen.state + late)) for late in (0.0, 1.0)]
+        brain.reset(ONLY, [0], 1)
+        brain.hold(seen.state)  # who takes over from a policy: a grip does not open to where it is measured
+        actions.append(brain.act(replace(seen, state=seen.state + 1.0)))
     held = {name: 0.0 if name in speeds else value for name, value in zip(names, seen.state[0], strict=True)}
     for action in actions:
         assert action.tolist() == [[9.0 if name in driven else held[name] for name in names]]  # type: ignore[union-attr]

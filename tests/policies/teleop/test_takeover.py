@@ -36,12 +36,16 @@ class Counting(Brain):
     def __init__(self, name: str, value: float) -> None:
         super().__init__(None)
         self.name, self._value, self.resets, self._count = name, value, 0, 0
+        self.held: list[Any] = []
 
     def bind(self, robot: RobotFeatures) -> None:
         self.bound = robot
 
     def reset(self, ids: Any, seeds: Sequence[int], n: int, instructions: Sequence[str] = ()) -> None:
         self.resets, self._count = self.resets + 1, 0
+
+    def hold(self, action: Any) -> None:
+        self.held.append(None if action is None else float(action[0, 0]))
 
     def needs_images(self, results: Any) -> Any:
         return np.array([self._count == 0])
@@ -72,6 +76,7 @@ def test_the_person_drives_while_they_have_taken_over_and_the_brain_starts_afres
         actions.append(float(both.act(SEEN)[0, 0]))
         interventions.append(bool(both.interventions()[0]))
     assert actions == [1.0, 2.0, 101.0, 102.0, 1.0, 2.0]
+    assert person.held == [2.0]
     assert interventions == taken
     assert looked == [True, False, True, False, True, False]
     assert both.parameters() == {"type": "policy", "takeover": {"type": "teleop"}}
@@ -106,6 +111,7 @@ def test_who_takes_over_and_does_nothing_yet_ends_what_a_chunk_would_go_on_with(
     # In the second frame the chunk's second action was in force.
     assert given == [None, None, 2.0, None, 103.0, 104.0, None, None]
     assert [isinstance(one, Chunk) for one in commands] == [True] + [False] * 5 + [True, False]
+    assert person.held == [2.0]
 
 
 @pytest.mark.law
