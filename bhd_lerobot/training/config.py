@@ -175,6 +175,8 @@ class BhdTrainConfig(TrainPipelineConfig):
             depth_output_unit=self.dataset.depth_output_unit,
             budget_gib=self.budget_gib,
             num_workers=self.num_workers,
+            prefetch_factor=self.prefetch_factor,
+            persistent_workers=self.persistent_workers,
             **fields,
         )
 

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bhd_lerobot.datasets.loader.config import LoaderConfig
 from bhd_lerobot.datasets.loader.gather import Batch
 from bhd_lerobot.datasets.loader.order import BatchOrder
 
@@ -80,19 +81,18 @@ class BatchLoader(Loader):
 class LeRobotLoader(Loader):
     """Batches of a `LeRobotDataset`, by PyTorch's `DataLoader`, in the same order as from memory."""
 
-    def __init__(
-        self, dataset: Any, order: BatchOrder, device: torch.device | str | None = None, num_workers: int = 0
-    ) -> None:
-        super().__init__(dataset, order, device)
+    def __init__(self, dataset: Any, order: BatchOrder, config: LoaderConfig) -> None:
+        super().__init__(dataset, order, config.device)
         from bhd_lerobot.stock import lerobot_collate_fn
 
         self._epoch = _Epoch()
         self._loader = torch.utils.data.DataLoader(
             dataset,
             batch_sampler=self._epoch,
-            num_workers=num_workers,
+            num_workers=config.num_workers,
+            prefetch_factor=config.prefetch_factor if config.num_workers else None,
             collate_fn=lerobot_collate_fn if dataset.meta.has_language_columns else None,
-            persistent_workers=num_workers > 0,
+            persistent_workers=config.persistent_workers and config.num_workers > 0,
             # Without it, each new iterator draws from the common generator, and a resumed run makes one more of them.
             generator=torch.Generator().manual_seed(0),
         )

@@ -42,6 +42,8 @@ class LoaderConfig(Options):
         keep: features to serve besides the index columns; None serves all. LeRobot's dataset always serves all.
         budget_gib: memory that columns and decoded images may take [GiB].
         num_workers: processes of PyTorch's `DataLoader`, where LeRobot's dataset is used.
+        prefetch_factor: batches that each of them prepares.
+        persistent_workers: keep them between epochs.
         drop_last: leave an incomplete batch out of the training's epochs.
         device: where batches are put, through page-locked memory if it is a GPU; None leaves them in memory.
         rank: this process among `world_size`.
@@ -72,6 +74,8 @@ class LoaderConfig(Options):
     keep: Collection[str] | None = None
     budget_gib: Annotated[float, Range("(0, inf]")] = 4.0
     num_workers: Whole = 0
+    prefetch_factor: Count = 4
+    persistent_workers: bool = True
     drop_last: bool = False
     device: torch.device | str | None = None
     rank: Whole = 0

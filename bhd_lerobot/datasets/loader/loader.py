@@ -115,7 +115,7 @@ def make_loader(
             order["weights"] = weights[samples]
         deal = BatchOrder(samples, config.batch_size, rank=config.rank, world_size=config.world_size, **order)
         if whole is None:
-            return LeRobotLoader(dataset, deal, config.device, config.num_workers)
+            return LeRobotLoader(dataset, deal, config)
         return BatchLoader(dataset, deal, config.device)
 
     training = load(

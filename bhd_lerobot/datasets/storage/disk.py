@@ -219,12 +219,17 @@ class RootLock:
         handle = os.open(self._root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             fcntl.flock(handle, self._kind | fcntl.LOCK_NB)
-        except BlockingIOError:
+        except OSError as error:
             os.close(handle)
-            raise DatasetLockedError(
-                f"{self._shown_as} is being recorded, repaired, edited or copied by another process. Wait until it ends"
-                f"{', or choose another root' if self._is_choice else ''}."
-            ) from None
+            if isinstance(error, BlockingIOError):
+                raise DatasetLockedError(
+                    f"{self._shown_as} is being recorded, repaired, edited or copied by another process. Wait until it "
+                    f"ends{', or choose another root' if self._is_choice else ''}."
+                ) from None
+            raise DatasetWriteError(
+                f"{self._shown_as} cannot be locked: {error.strerror}. Its file system has no locks, which keep two "
+                "programs from writing a dataset at once; put it on a local disk."
+            ) from error
         self._handle = handle
         # The folder may be renamed while it is locked; a second time it is taken under its final name.
         self._root = self._shown_as

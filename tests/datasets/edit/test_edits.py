@@ -1,5 +1,6 @@
 """Merging, keeping, deleting and splitting: laws about what is in the result, whatever is killed or full."""
 
+import errno
 import json
 import os
 import shutil
@@ -26,6 +27,7 @@ from bhd_lerobot.errors import (
     DatasetExistsError,
     DatasetLockedError,
     DatasetMismatchError,
+    DatasetWriteError,
     UnsupportedDatasetError,
 )
 from tests.datasets import support
@@ -259,6 +261,16 @@ def test_a_dataset_that_is_being_recorded_is_refused(tmp_path: Path) -> None:
     support.killed(tmp_path / "open", 1)
     with pytest.raises(DatasetError, match="bhd-data repair"):
         merge([root, tmp_path / "open"], tmp_path / "all")
+
+
+def test_a_file_system_without_locks_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    root = record(tmp_path / "d", [0, 1])
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises(DatasetWriteError, match=f"{root} cannot be locked: No locks available"):
+        delete(root, [0])
 
 
 def stock(root: Path) -> Path:

@@ -179,8 +179,12 @@ def test_the_table_by_episode(plain: Path) -> None:
 
 
 @pytest.mark.thorough(but=1)
-@pytest.mark.parametrize("workers", [0, 1])
-def test_the_fallback_serves_the_same_batches_and_reports_it_once(video_dataset: Path, workers: int) -> None:
+@pytest.mark.parametrize(
+    "workers",
+    [{}, {"num_workers": 1}, {"num_workers": 1, "persistent_workers": False, "prefetch_factor": 1}],
+    ids=["no worker", "one that stays", "one an epoch"],
+)
+def test_the_fallback_serves_the_same_batches_and_reports_it_once(video_dataset: Path, workers: dict[str, Any]) -> None:
     messages: list[str] = []
     options: dict[str, Any] = {
         "batch_size": 6,
@@ -193,7 +197,7 @@ def test_the_fallback_serves_the_same_batches_and_reports_it_once(video_dataset:
     }
     memory = make_loader("t/t", LoaderConfig(**options), root=video_dataset, report=messages.append)
     assert (messages, memory.message) == ([], "")
-    small = LoaderConfig(**options, budget_gib=1e-4, num_workers=workers)
+    small = LoaderConfig(**options, budget_gib=1e-4, **workers)
     stock = make_loader("t/t", small, root=video_dataset, report=messages.append)
     assert messages == [stock.message]
     assert "more than the budget of 0.0001 GiB" in stock.message
