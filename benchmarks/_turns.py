@@ -3,6 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 
@@ -15,7 +16,11 @@ def seconds(work: Callable[[], object]) -> float:
 
 def rates(works: Mapping[str, Callable[[], object]], count: int) -> dict[str, Callable[[], float]]:
     """Return what measures how many a second each of them does, for `in_turns`; a call of one does so many."""
-    return {name: lambda work=work: count / seconds(work) for name, work in works.items()}
+    return {name: partial(_rate, work, count) for name, work in works.items()}
+
+
+def _rate(work: Callable[[], object], count: int) -> float:
+    return count / seconds(work)
 
 
 def in_turns(parts: Mapping[str, Callable[[], float]], turns: int, *, uncounted: int = 1) -> dict[str, list[float]]:

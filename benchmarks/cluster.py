@@ -54,6 +54,7 @@ def configuration(root: Path, episode_s: float) -> RecordConfig:
 
 def record(config: RecordConfig, pool: WorkerPool | None, episodes: int) -> float:
     """Record into a new dataset; return how long it took to run and save all episodes [s]."""
+    assert config.brain is not None
     simulation = make_robot(config.robot, 1, 1)
     task, brain = make_task(config.task, 1, config.dataset.fps), make_brain(config.brain)
     loop = EpisodeLoop(simulation, task, brain)
@@ -88,8 +89,10 @@ def main() -> int:
     config = configuration(Path("unused"), options.episode_s)
     quiet = Console(quiet=True)
     started = time.perf_counter()
-    shared = {"num_workers": 2, "address": "local"}
-    with open_pool(RayConfig(**shared), quiet) as two, WorkerPool(RayConfig(num_workers=1), quiet) as one:
+    with (
+        open_pool(RayConfig(num_workers=2, address="local"), quiet) as two,
+        WorkerPool(RayConfig(num_workers=1), quiet) as one,
+    ):
 
         def turn(pool: WorkerPool | None) -> float:
             if pool is None:

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -461,9 +462,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stack.callback(calls.close, calls.hold_cpu_latency(0))
         loops: list[tuple[str, str, Run]] = []
         for robot in options.robots:
-            loops += [(robot, TWIN, lambda *one: run_twin(*one, folder)), (robot, OURS, run_robot)]
+            loops += [(robot, TWIN, partial(run_twin, folder=folder)), (robot, OURS, run_robot)]
             if robot == "ur5":
-                loops.append((robot, VIDEO, lambda *one: run_robot(*one, folder)))
+                loops.append((robot, VIDEO, partial(run_robot, folder=folder)))
         found, notes = measure(loops, options.conditions, blocks, seconds)
     if not found:
         print("Nothing was measured.", *notes, sep="\n", file=sys.stderr)

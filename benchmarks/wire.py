@@ -49,7 +49,7 @@ ROUNDING = 1.021  # a trajectory ends inside a tick
 # largest speed within 0.6, and one that carries an arm, whose stop is gentler, within 1.5; an arm that is found to be
 # blocked for 50 ms goes on meanwhile.
 _OF_ARM = dict.fromkeys(LIES, 0.2) | dict.fromkeys(("drifting", "frozen", "counting twice"), 0.35)
-NEEDED = {
+NEEDED: dict[str, dict[str, tuple[float, ...]]] = {
     "joints": {lie: (most,) for lie, most in _OF_ARM.items()},
     "wheels": dict.fromkeys(LIES, (0.6,)),
     MOBILE: {lie: (most, 1.5) for lie, most in _OF_ARM.items()},
@@ -484,10 +484,10 @@ def main(arguments: list[str] | None = None) -> int:
         lies.add_column(column, justify="left" if column in ("robot", "reading") else "right")
     for space in NEEDED:
         for lie in LIES:
-            one = deceive(space, lie, options.streams, options.frames, options.seed)
-            unsafe += one.unsafe + (not one.is_short(space, lie)) + (space != "wheels" and one.faster > FASTER)
-            numbers = (f"{one.streams:,}", f"{one.stopped:,}", f"{one.unsafe:,}")
-            lies.add_row(space, lie, *numbers, " / ".join(f"{way:.3f} rad" for way in one.moved), f"{one.faster:.2f}")
+            told = deceive(space, lie, options.streams, options.frames, options.seed)
+            unsafe += told.unsafe + (not told.is_short(space, lie)) + (space != "wheels" and told.faster > FASTER)
+            counts = (f"{told.streams:,}", f"{told.stopped:,}", f"{told.unsafe:,}")
+            lies.add_row(space, lie, *counts, " / ".join(f"{way:.3f} rad" for way in told.moved), f"{told.faster:.2f}")
     console.print(lies)
     table, found = impedance_table(options.streams, options.frames, options.seed)
     console.print(table)

@@ -112,7 +112,7 @@ class Runner:
         Raises:
             FailedError: a command failed.
         """
-        parts = [(name, section["once"], {})] if "once" in section else []
+        parts: list[tuple[str, Any, dict[str, int]]] = [(name, section["once"], {})] if "once" in section else []
         parts += [
             (f"{part}_{seed}", spec, {"seed": seed})
             for part, spec in section.get("parts", {}).items()
