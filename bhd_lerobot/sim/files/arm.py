@@ -30,6 +30,7 @@ from bhd_lerobot.bodies.body import (
     Workspace,
 )
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
@@ -47,6 +48,7 @@ _STRETCH = 0.03  # [rad] by so much at the most is a servo off while it accelera
 _MOST_ACCELERATION, _SPARE = 15.0, 0.5  # [rad/s^2]; share of the torque left by the weight that accelerations may need
 _SPEED = 2.0  # [rad/s] of a joint of which nothing is known: small servos and large arms can do that
 _NEAR = 0.003  # [m] that the arm stays away from itself and the table
+_ON_AXIS = 0.001  # [m] from the first joint's axis: what is no farther turns on the spot
 _LIKELY = 0.01  # share of the postures around home that tasks may ask for
 _POSTURES = 4000  # that are drawn to find out what an arm reaches
 _HELD_SHARE = 0.4  # of the payload, with which a joint has to arrive
@@ -84,13 +86,32 @@ def arm_body(
         raise ConfigError(
             f"The load (robot.payload) is {load} kg; the {file.name} carries between 0 and {arm.payload:.3g} kg."
         )
-    chain = arm.chain
-    moving = [capsule.name for capsule in chain.capsules if capsule.frame > 1]
-    pairs = tuple((obstacle.name, name) for obstacle in obstacles for name in moving)
-    chain = replace(chain, capsules=(*chain.capsules, *obstacles), disjoint=(*chain.disjoint, *pairs))
+    chain = _among(arm.chain, obstacles, np.array(arm.home[: arm.chain.dof])) if obstacles else arm.chain
     limits = replace(arm.limits, command_timeout_s=command_timeout_s)
     cameras = {name: CameraSpec(name, camera_width, camera_height) for name in body.cameras}
     return replace(body, arm=replace(arm, chain=chain, limits=limits, load=load), cameras=cameras)
+
+
+def _among(chain: ArmChain, obstacles: Sequence[Capsule], home: Array) -> ArmChain:
+    """Return a chain whose distances from obstacles are checked, of all that its joints move.
+
+    What turns on the spot with the first joint does not move. Where the arm stands on, or in, an obstacle, the first
+    link is too near to it at home already, and says nothing about a posture.
+    """
+    rotation, position = np.array(chain.links[0].rotation), np.array(chain.links[0].position)
+
+    def is_swept(capsule: Capsule) -> bool:
+        ends = np.array([capsule.start, capsule.end]) @ rotation.T + position
+        return bool(np.hypot(ends[:, 0], ends[:, 1]).max() > _ON_AXIS)
+
+    first = [capsule.name for capsule in chain.capsules if capsule.frame == 1 and is_swept(capsule)]
+    farther = [capsule.name for capsule in chain.capsules if capsule.frame > 1]
+    chain = replace(chain, capsules=(*chain.capsules, *obstacles))
+    pairs = [(obstacle.name, name) for obstacle in obstacles for name in first]
+    apart = CollisionModel(replace(chain, disjoint=tuple(pairs))).each(home[None])[: len(pairs), 0]
+    pairs = [pair for pair, distance in zip(pairs, apart, strict=True) if distance >= chain.min_distance]
+    pairs += [(obstacle.name, name) for obstacle in obstacles for name in farther]
+    return replace(chain, disjoint=(*chain.disjoint, *pairs))
 
 
 class _Arm(RobotFile):

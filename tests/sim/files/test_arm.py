@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from bhd_lerobot.bodies.arm_file import ArmFile, GripperFile
-from bhd_lerobot.bodies.body import Arm, Body, GripperSpec
+from bhd_lerobot.bodies.body import Arm, Body, Capsule, GripperSpec
 from bhd_lerobot.bodies.so101 import SO101
 from bhd_lerobot.bodies.tabletop import TableScene
 from bhd_lerobot.control.commands import ResultCode
+from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
@@ -194,6 +195,25 @@ OTHER = (
     '</body></body></worldbody><equality><joint joint1="one" joint2="two"/><tendon tendon1="both"/></equality>'
     '<tendon><fixed name="both"><joint joint="one" coef="1"/><joint joint="two" coef="1"/></fixed></tendon>'
 )
+
+
+@pytest.mark.law
+def test_obstacles_are_kept_away_from_by_all_that_a_joint_moves(tmp_path: Path) -> None:
+    wing = '<body name="shoulder"', '<geom type="capsule" fromto="0 -0.1 0 0 -0.2 0" size="0.01"/>'
+    text = re.sub(rf"({wing[0]}[^>]*>)", rf"\1{wing[1]}", TEXT)
+    file = written(tmp_path, text, tool="gripper_frame")
+    arm = arm_body(file).need(Arm)
+    chain, turned = arm.chain, np.array(arm.home[: arm.chain.dof])
+    turned[0] += 1.5
+    frames = ForwardKinematics(chain).frames(turned)
+    assert any(one.radius < 0.012 and one.frame == 1 for one in chain.capsules)
+    for capsule in [one for one in chain.capsules if one.frame > 1 or one.radius < 0.012]:
+        place = frames[capsule.frame]
+        point = tuple((place[:3, :3] @ capsule.end + place[:3, 3]).tolist())
+        obstacle = Capsule("obstacle_0", 0, point, point, 0.002)
+        seen = CollisionModel(arm_body(file, obstacles=(obstacle,)).need(Arm).chain)
+        pairs = dict(zip(seen.chain.disjoint, seen.each(turned[None])[:, 0], strict=False))
+        assert pairs["obstacle_0", capsule.name] < 0.0, capsule.name
 
 
 def test_of_two_arms_in_a_file_what_couples_joints_of_the_other_is_left_out(tmp_path: Path) -> None:
