@@ -132,7 +132,7 @@ def _lines(config_class: type, prefix: str, title: str, chosen: Mapping[str, str
             option = f"{key}.NAME.type" if entry else f"{key}.type"
             picked = {given: type_name for given, type_name in chosen.items() if _is(given, option)}
             is_taken = getattr(config_class, "taken", {}).get(name, bool)
-            valid = ", ".join(one for one in valid_names(entry or kind) if is_taken(choices.get(one, object)))
+            valid = ", ".join(valid_names(entry or kind, is_taken))
             if set(picked.values()) - choices.keys():
                 choices = choices_of(entry or kind, of_lerobot=True)
             known = {given: type_name for given, type_name in picked.items() if type_name in choices}

@@ -11,7 +11,7 @@ import keyword
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -178,6 +178,7 @@ def read_file(path: Path) -> dict[str, Any]:
 def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others: str) -> None:
     """Raise unless all options exist; `others` are valid, too, and none of the class's own."""
     fields = {name: (kind, default) for name, kind, default in options_of(config_class)}
+    taken = getattr(config_class, "taken", {})
     for old, new in getattr(config_class, "renamed", {}).items():
         if old in values and new not in values:
             values[new] = values.pop(old)
@@ -199,18 +200,18 @@ def _check_keys(config_class: type, values: dict[str, Any], prefix: str, *others
         kind, default = fields[key]
         of_default = isinstance(value, dict) and "type" not in value and isinstance(default, draccus.ChoiceRegistry)
         given = {"type": default.get_choice_name(type(default)), **value} if of_default else value
-        values[key] = _checked(f"{prefix}{key}", given, kind)
+        values[key] = _checked(f"{prefix}{key}", given, kind, taken.get(key, bool))
         check_option(f"{prefix}{key}", values[key], declared_types(config_class)[key])
     for name, kind, default in options_of(config_class):
         if default is dataclasses.MISSING and name not in values:
             if dataclasses.is_dataclass(kind) and not choices_of(kind):
                 _check_keys(typing.cast(type, kind), {}, f"{prefix}{name}.")  # names what is missing in it
-            choice = f".type, one of {', '.join(valid_names(kind))}" if choices_of(kind) else ""
+            choice = f".type, one of {', '.join(valid_names(kind, taken.get(name, bool)))}" if choices_of(kind) else ""
             raise ConfigError(f"The option {prefix}{name} is required; set --{prefix}{name}{choice}.")
 
 
-def _checked(key: str, value: Any, kind: Any) -> Any:
-    """Return the value of an option whose keys, if it has any, all exist."""
+def _checked(key: str, value: Any, kind: Any, is_taken: Callable[[type], bool] = bool) -> Any:
+    """Return the value of an option whose keys, if it has any, all exist; messages name types that are taken."""
     choices, entries = choices_of(kind), entries_of(kind)
     if choices and isinstance(value, str):  # short for its type: robot="ur5"
         value = {"type": value}
@@ -223,13 +224,13 @@ def _checked(key: str, value: Any, kind: Any) -> Any:
         chosen = value.get("type")
         if chosen is None:
             given = f"; given: {', '.join(f'{key}.{name}' for name in value)}" if value else ""
-            raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(valid_names(kind))}.")
+            raise ConfigError(f"{key}.type is missing{given}. Valid: {', '.join(valid_names(kind, is_taken))}.")
         if chosen not in choices and chosen in valid_names(kind):
             choices = choices_of(kind, of_lerobot=True)
         if chosen not in choices:
+            unknown = unknown_name(f"{key}.type", chosen, valid_names(kind, is_taken))
             raise ConfigError(
-                f"{unknown_name(f'{key}.type', chosen, valid_names(kind))} To use one that your module registers: "
-                f"--{key}.discover_packages_path=MODULE."
+                f"{unknown} To use one that your module registers: --{key}.discover_packages_path=MODULE."
             )
         fields = {k: v for k, v in value.items() if k != "type"}
         _check_keys(choices[chosen], fields, f"{key}.", "type")
@@ -339,10 +340,16 @@ def types_of(config: Any) -> str:
     return " or ".join(repr(name) for name, kind in config.get_known_choices().items() if kind is type(config))
 
 
-def valid_names(kind: Any) -> list[str]:
-    """Return what may be chosen of a choice type, LeRobot's own included, which are not imported."""
+def valid_names(kind: Any, is_taken: Callable[[type], bool] = bool) -> list[str]:
+    """Return what may be chosen of a choice type, LeRobot's own included, which are not imported.
+
+    Args:
+        is_taken: whether a class may be chosen; it gets `object` for one that is not imported.
+    """
     kind = _without_none(kind)
-    return sorted({*choices_of(kind), *names_of_lerobot(getattr(kind, "lerobot_package", kind.__module__))})
+    known = choices_of(kind)
+    names = {*known, *names_of_lerobot(getattr(kind, "lerobot_package", kind.__module__))}
+    return sorted(name for name in names if is_taken(known.get(name, object)))
 
 
 def _without_none(kind: Any) -> Any:

@@ -5,8 +5,10 @@ import re
 import lerobot.policies  # noqa: F401  registers LeRobot's policies
 import pytest
 
+from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.evaluation.config import EvalConfig
 from bhd_lerobot.options.help import help_of
+from bhd_lerobot.options.parse import parse
 from bhd_lerobot.options.plugins import load_lerobot
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.rollout.replay.config import ReplayConfig
@@ -42,9 +44,10 @@ def test_a_chosen_type_lists_its_options_with_units_and_defaults() -> None:
 
 @pytest.mark.parametrize("program", [ServeConfig, BridgeConfig])
 def test_types_that_a_program_refuses_are_not_listed(program: type) -> None:
-    assert "Valid: arm, so101, turtlebot3, ur10e, ur3e, ur5, ur5e. Its options" in " ".join(
-        help_of(program, {}).split()
-    )
+    taken = "Valid: arm, so101, turtlebot3, ur10e, ur3e, ur5, ur5e. "
+    assert f"{taken}Its options" in " ".join(help_of(program, {}).split())
+    with pytest.raises(ConfigError, match=f"Did you mean 'turtlebot3'. {taken}"):
+        parse(program, ["--robot.type=turtelbot3"])
 
 
 def test_brains_by_name() -> None:
