@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.bodies.scenes import scene_to_json
@@ -24,9 +24,6 @@ from bhd_lerobot.robots.host.config import RealtimeConfig
 from bhd_lerobot.robots.host.host import Host
 from bhd_lerobot.robots.host.process import LiveSpec
 from bhd_lerobot.robots.host.state import published_dtype
-
-if TYPE_CHECKING:  # planning takes 100 MB, and a base plans nothing
-    pass
 
 _LIFE_S = 0.02  # between two signs of life of this process
 _START_S = 120.0  # that a process may take to import, build its model and warm up
@@ -54,7 +51,7 @@ class LiveLink:
         rates = mirror.rates
         goals = getattr(mirror.cerebellum.controller, "goals", None)
         dof, plans = 0 if mirror.body.arm is None else len(mirror.body.arm.chain.joints), 0
-        if goals is not None:
+        if goals is not None:  # planning takes 100 MB, and a base plans nothing
             from bhd_lerobot.realtime.planning_link import PlanningLink, PlanServer
 
             plans = PlanningLink.nbytes(dof, len(mirror.body.need(Arm).limits.names), rates.control_hz)
