@@ -26,24 +26,30 @@ STOP = np.array(LIMITS.stop_deceleration)
 class PerfectArm(Plant):
     """Joints without inertia behind servos with stiffness and damping: they lag as the real ones do."""
 
+    home = HOME
+
     def __init__(self, n: int) -> None:
         self.n = n
-        self.position = np.tile(HOME, (n, 1))
-        self.velocity = np.zeros((n, 7))
+        self.position, self.velocity = np.tile(self.home, (n, 1)), np.zeros((n, 7))
         self.fault = np.zeros(n, np.bool_)
-        self.lie: dict[int, float] = {}  # simulation -> what its encoders read instead
-        self.stuck = np.zeros(n, np.bool_)
+        self.lie: dict[int, dict[int, float]] = {}  # simulation -> joint -> what its encoder reads instead
+        self.stuck = np.zeros((n, 7), np.bool_)
         self.written: list[np.ndarray] = []
 
     def read(self, out: PlantReading) -> None:
         out.position[:], out.velocity[:], out.safety[:] = self.position, self.velocity, self.fault
-        for sim, value in self.lie.items():
-            out.position[sim, 2] = out.velocity[sim, 1] = value
+        for sim, lies in self.lie.items():
+            for joint, value in lies.items():
+                out.position[sim, joint] = value
+
+    def speeds(self, ctrl: np.ndarray) -> np.ndarray:
+        """Return how fast joints turn that nothing holds, shape (n, 7)."""
+        return (ctrl - self.position) / LEAD
 
     def write(self, ctrl: np.ndarray) -> None:
         assert np.isfinite(ctrl).all()
         self.written.append(ctrl.copy())
-        self.velocity = np.where(self.stuck[:, None], 0.0, (ctrl - self.position) / LEAD)
+        self.velocity = np.where(self.stuck, 0.0, self.speeds(ctrl))
         self.position = self.position + self.velocity / HZ
 
 

@@ -9,7 +9,7 @@ from bhd_lerobot.bodies.turtlebot3_manipulation import turtlebot3_manipulation
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.arm.mobile import MobileArmController
 from bhd_lerobot.control.drive import BaseController
-from bhd_lerobot.control.plant import Plant, PlantReading
+from bhd_lerobot.control.plant import PlantReading
 from tests.control import arm_rig
 from tests.control.arm_rig import FRAME, HZ
 
@@ -31,27 +31,24 @@ CHANGE = np.array([*((_SPEED + 2 * LEAD * _STOP) / HZ), *[sum(_WHEEL_STOP) / DRI
 BEND = np.array([*(_STOP / HZ * (1 / HZ + 2 * LEAD)), np.inf, np.inf])
 
 
-class PerfectMobileArm(Plant):
-    """Joints without inertia behind servos that lag, and wheels that turn as commanded; it judges what is written."""
+class PerfectMobileArm(arm_rig.PerfectArm):
+    """Joints as an arm's, and wheels that turn as commanded; it judges what is written."""
+
+    home = HOME
 
     def __init__(self, n: int) -> None:
-        self.n = n
-        self.position, self.velocity = np.tile(HOME, (n, 1)), np.zeros((n, 7))
-        self.fault = np.zeros(n, np.bool_)
-        self.lie: dict[int, dict[int, float]] = {}  # simulation -> joint -> what its encoder reads instead
-        self.stuck = np.zeros((n, 7), np.bool_)
+        super().__init__(n)
         self.anew = np.ones(n, np.bool_)  # robots that the next command need not be near to the last of
         self.last, self.rate, self.read_last = self.position.copy(), np.zeros((n, 7)), self.position.copy()
 
     def read(self, out: PlantReading) -> None:
-        out.position[:], out.velocity[:], out.safety[:] = self.position, self.velocity, self.fault
-        for sim, lies in self.lie.items():
-            for joint, value in lies.items():
-                out.position[sim, joint] = value
+        super().read(out)
         self.read_last = out.position.copy()
 
+    def speeds(self, ctrl: Array) -> Array:
+        return np.concatenate([(ctrl[:, ARM] - self.position[:, ARM]) / LEAD, ctrl[:, WHEELS]], axis=1)
+
     def write(self, ctrl: Array) -> None:
-        assert np.isfinite(ctrl).all()
         assert (ctrl >= LOWER - 1e-9).all(), ctrl
         assert (ctrl <= UPPER * (1 + 1e-6) + 1e-9).all(), ctrl
         rate = ctrl - self.last
@@ -61,9 +58,7 @@ class PerfectMobileArm(Plant):
         assert ((np.abs(rate - self.rate) <= BEND * 1.021) | nearer | self.anew[:, None]).all(), rate - self.rate
         self.last, self.rate = ctrl.copy(), np.where(self.anew[:, None], 0.0, rate)
         self.anew[:] = False
-        velocity = np.concatenate([(ctrl[:, ARM] - self.position[:, ARM]) / LEAD, ctrl[:, WHEELS]], axis=1)
-        self.velocity = np.where(self.stuck, 0.0, velocity)
-        self.position = self.position + self.velocity / HZ
+        super().write(ctrl)
 
 
 class Rig(arm_rig.Rig):

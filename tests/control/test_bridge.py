@@ -67,20 +67,6 @@ def test_a_frame_longer_than_the_time_out_is_an_error_that_says_how_fast_is_enou
         LockstepBridge(Cerebellum(BODY, PerfectPlant(), 100, BaseController(BODY.drive, 1, 100)), RATES, lambda: None)
 
 
-def test_a_chunk_is_one_command_a_frame() -> None:
-    chunked, single = perfect(), perfect()
-    values = np.array([[(0.2, 0.0)], [(0.1, 1.0)], [(-0.1, -1.0)], [(0.0, 0.5)]])
-    assert all(result.accepted.all() for result in chunked.send_chunk(values))
-    for row in values:
-        single.send(row)
-        chunked.advance_frame()
-        single.advance_frame()
-        assert chunked.state().command.tobytes() == single.state().command.tobytes()
-    # Nothing comes after the chunk: its last command grows old.
-    chunked.advance_ticks(200)
-    assert chunked.state().mode.tolist() == [Mode.HOLD]
-
-
 @pytest.mark.law
 def test_a_setpoint_takes_the_place_of_what_is_left_of_a_chunk() -> None:
     """A person takes over from a policy that has sent what it wants to do in the coming second."""

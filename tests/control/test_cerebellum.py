@@ -277,25 +277,6 @@ def test_integer_commands_are_accepted() -> None:
     assert rig.command == [0, 1]
 
 
-@each_case(
-    ("sequence", "expected"),
-    [
-        ([(0.0, 0.0)], Limit.NONE),
-        ([(0.01, 0.01)], Limit.NONE),  # within one tick's change
-        ([(0.2, 0.0)], Limit.ACCELERATION),
-        ([(0.5, 0.0)], Limit.ACCELERATION | Limit.VELOCITY),
-        ([(0.0, -9.0)], Limit.ACCELERATION | Limit.VELOCITY),
-        ([(0.22, 2.84)], Limit.ACCELERATION | Limit.VELOCITY),  # each is possible, both at once are not
-    ],
-)
-def test_limit_flags(sequence: list[tuple[float, float]], expected: Limit) -> None:
-    rig = Rig()
-    for twist in sequence:
-        rig.send(*twist)
-        rig.tick(20)
-    assert Limit(int(rig.cerebellum.take_flags()[0][0])) == expected
-
-
 def test_a_limit_that_still_holds_is_reported_in_every_frame() -> None:
     rig = Rig()
     for _ in range(20):

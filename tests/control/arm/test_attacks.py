@@ -13,10 +13,10 @@ from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.clearance import fill_geometry, new_geometries
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.geometry.dynamics import ArmDynamics
-from bhd_lerobot.control.messages import Limit, Mode, Request, Setpoint, Watchdog
+from bhd_lerobot.control.messages import Mode, Request, Watchdog
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
-from tests.control.arm_rig import ARM, FRAME, HOME, HZ, LIMITS, SWEEP, PerfectArm, Rig, off, posture
+from tests.control.arm_rig import ARM, FRAME, HZ, LIMITS, SWEEP, PerfectArm, Rig, posture
 
 ONE = np.ones(1, np.bool_)
 
@@ -146,33 +146,6 @@ def test_a_guard_that_trips_out_of_the_range_lets_the_arm_go_on_after_a_reset() 
     assert (rig.mode, int(rig.cerebellum.take_flags()[1][0])) == (Mode.HOLD, 0)
 
 
-def test_an_arm_that_is_forgotten_in_motion_stays_where_it_is_commanded_to() -> None:
-    rig = Rig()
-    rig.go(**SWEEP)
-    rig.tick(60)
-    rig.cerebellum.take_flags()
-    rig.cerebellum.restart(np.zeros(1, np.intp))
-    rig.tick(5)
-    assert int(rig.cerebellum.take_flags()[1][0]) == 0
-
-
-@pytest.mark.parametrize("rows", [[np.full(7, np.nan)], [off(j0=-0.3), np.full(7, np.nan)]], ids=["alone", "second"])
-def test_after_garbage_in_the_queue_an_arm_follows_nothing_before_it_is_reset(rows: list[np.ndarray]) -> None:
-    rig = Rig()
-    rig.stream(off(j0=0.05), 2)
-    for row in rows:  # all due in the same tick
-        rig.sequence += 1
-        rig.cerebellum.fifo.push(rig.sequence, rig.now, row[None], ONE)
-    rig.tick()
-    assert rig.mode == Mode.FAULT
-    assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
-    rig.tick(100)
-    stopped = rig.cerebellum.written.copy()
-    rig.send(off(j0=0.3))
-    rig.tick(100)
-    np.testing.assert_array_equal(rig.cerebellum.written, stopped)
-
-
 def test_whatever_surrounds_an_arm_leaves_room_for_what_it_holds() -> None:
     for count in range(30, 64, 3):
         obstacles = [
@@ -184,38 +157,3 @@ def test_whatever_surrounds_an_arm_leaves_room_for_what_it_holds() -> None:
         except ConfigError:
             continue
         fill_geometry(geometries[1], chain.holding(Capsule(HELD, 6, chain.tool.position, (0.0, 0.0, 0.2), 0.02)))
-
-
-def follow(n: int, arm: int) -> np.ndarray:
-    """Return what is written to an arm whose number among n says nothing of what it does."""
-    rig, rng, rows = Rig(n), np.random.default_rng(arm), []
-    others = [(sim, np.random.default_rng(sim)) for sim in range(n)] if n > 1 else [(0, rng)]
-    for _ in range(60):
-        for sim, own in others:
-            draw, values = own.random(), HOME + own.normal(0, 0.2, 7) * (1, 1, 1, 1, 1, 1, 0.05)
-            mask = np.arange(n) == sim
-            if draw < 0.4:
-                rig.sequence += 1
-                rig.cerebellum.offer(Setpoint(rig.sequence, rig.now, np.broadcast_to(values, (n, 7))), mask)
-            elif draw < 0.5:
-                rig.go(sim, joint_target=tuple(values[:6].tolist()), gripper=0.02, preempt=draw < 0.42)
-            elif draw < 0.53:
-                rig.cerebellum.estop.press(np.array([sim]))
-            elif draw < 0.56:
-                rig.plant.lie = {**rig.plant.lie, sim: np.nan}
-            elif draw < 0.7:
-                rig.plant.lie.pop(sim, None)
-            elif draw < 0.73:
-                rig.cerebellum.restart(np.array([sim]))
-                rig.cerebellum.request(Request.CONFIGURE, np.array([sim]))
-            elif draw < 0.9:
-                rig.cerebellum.request(Request.RESET, np.array([sim]))
-                rig.cerebellum.request(Request.ACTIVATE, np.array([sim]))
-        rig.tick(FRAME)
-        rows.append(rig.cerebellum.written[arm if n > 1 else 0].copy())
-    return np.array(rows)
-
-
-@pytest.mark.parametrize("arm", range(4))
-def test_an_arm_among_others_is_bit_for_bit_the_arm_alone(arm: int) -> None:
-    np.testing.assert_array_equal(follow(4, arm), follow(1, arm))

@@ -166,17 +166,6 @@ def test_a_goal_replaces_setpoints_and_finishes_without_them() -> None:
     rig.check()
 
 
-def test_a_setpoint_of_one_arm_does_not_end_the_goal_of_another() -> None:
-    rig = Rig(2)
-    for sim in range(2):
-        rig.go(sim, **SWEEP)
-    rig.tick(100)
-    rig.send(off(j0=-0.1), np.array([True, False]))
-    rig.tick(1500)
-    assert rig.results(0) == [("1", ResultCode.REPLACED_BY_SETPOINT)]
-    assert rig.results(1) == [("2", ResultCode.SUCCEEDED)]
-
-
 @pytest.mark.law
 def test_a_goal_that_comes_while_the_arm_still_brakes_after_one_is_stopped_like_any_other() -> None:
     """A brain that falls silent twice: the second silence stops what it sent after the first."""
@@ -252,8 +241,8 @@ def test_a_deactivation_stops_and_switches_off(by: str) -> None:
     rig.check()
 
 
-@pytest.mark.parametrize("what", [np.nan, np.inf, "fault"])
-def test_a_reading_that_cannot_be_is_a_fault_and_ends_the_goal(what: float | str) -> None:
+@pytest.mark.parametrize("what", ["no number", "fault"])
+def test_a_reading_that_cannot_be_is_a_fault_and_ends_the_goal(what: str) -> None:
     rig = Rig(2)
     for sim in range(2):
         rig.go(sim, **SWEEP)
@@ -261,7 +250,7 @@ def test_a_reading_that_cannot_be_is_a_fault_and_ends_the_goal(what: float | str
     if what == "fault":
         rig.plant.fault[0] = True
     else:
-        rig.plant.lie[0] = float(what)
+        rig.plant.lie[0] = {2: np.nan}
     rig.tick(300)
     assert rig.mode == Mode.FAULT
     assert rig.results(0) == [("1", ResultCode.FAULT)]
@@ -296,6 +285,10 @@ def test_a_restarted_arm_behaves_like_a_new_one() -> None:
     used.go(**SWEEP)
     used.tick(130)
     used.stream(off(j0=9.0), 3)
+    used.cerebellum.take_flags()
+    used.cerebellum.restart(np.array([0]))
+    used.tick(5)  # it is forgotten in motion, and stays where it is commanded to
+    assert used.cerebellum.take_flags()[1].tolist() == [Watchdog.NONE]
     used.plant.position[:], used.plant.velocity[:] = HOME, 0.0
     used.cerebellum.restart(np.array([0]))
     used.request(Request.CONFIGURE)
@@ -339,18 +332,11 @@ def test_an_arm_that_is_held_fast_is_asked_for_more_effort_than_it_has_and_its_g
     assert not limits[1] & Limit.EFFORT
     assert rig.results(0) == [("1", ResultCode.PATH_TOLERANCE)]
     assert rig.results(1) == [("2", ResultCode.SUCCEEDED)]
+    assert np.abs(rig.cerebellum.state(rig.now).joint_efforts[1]).max() < 1e-6  # at rest nothing is asked of a servo
     # The reference of a protective stop is where the joints are, at once; what the servos get does not jump.
     change = np.abs(np.diff(rig.plant.written, axis=0)).max(axis=(0, 1))
     assert (change <= rig.cerebellum.numbers["change"][0, :7]).all()
     assert not rig.modes[-1][0] == rig.modes[-1][1] == Mode.FAULT
-
-
-def test_servo_effort_is_zero_at_rest() -> None:
-    rig = Rig()
-    rig.tick(10)
-    state = rig.cerebellum.state(rig.now)
-    assert np.abs(state.joint_efforts).max() < 1e-9
-    assert state.odometry.shape == (1, 0)
 
 
 actions = st.one_of(
@@ -375,7 +361,7 @@ def act(rig: Rig, kind: str, value: float) -> None:
     elif kind == "estop":
         rig.cerebellum.estop.press()
     elif kind == "nan":
-        rig.plant.lie[0] = np.nan
+        rig.plant.lie[0] = {2: np.nan}
     elif kind == "deactivate":
         rig.request(Request.DEACTIVATE)
     else:
@@ -463,7 +449,7 @@ def test_a_stop_is_not_over_before_the_arm_is_at_rest_however_often_it_stops() -
 
 def test_an_arm_is_not_reset_before_it_is_known_where_it_is() -> None:
     rig = Rig(active=False)
-    rig.plant.lie[0] = np.nan
+    rig.plant.lie[0] = {2: np.nan}
     rig.tick(50)
     assert rig.mode == Mode.FAULT
     for _ in range(3):

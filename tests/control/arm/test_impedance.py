@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bhd_lerobot.bodies.body import Body
 from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.control.arm.compliance import Compliance
 from bhd_lerobot.control.arm.impedance import ImpedanceController
@@ -13,6 +14,7 @@ from bhd_lerobot.control.geometry.dynamics import ArmDynamics
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request
 from bhd_lerobot.control.plant import Plant, PlantReading
 from bhd_lerobot.errors import ConfigError
+from tests.cases import each_case
 from tests.control.arm_rig import HZ, Rig
 
 Array = NDArray[np.float64]
@@ -67,7 +69,7 @@ def test_the_command_is_the_pose_and_the_opening() -> None:
 
 
 @pytest.mark.law
-def test_a_wrench_needs_setpoints_and_ends_with_them() -> None:
+def test_a_wrench_needs_setpoints_and_ends_with_them_or_at_once_with_a_hard_stop() -> None:
     rig = StuckRig()
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
     rig.tick(100)
@@ -79,10 +81,6 @@ def test_a_wrench_needs_setpoints_and_ends_with_them() -> None:
     assert not rig.controller.wrench.any()
     rig.send(10)
     assert not rig.controller.wrench.any()  # it has to be asked for again
-
-
-def test_a_hard_stop_ends_a_wrench_at_once() -> None:
-    rig = StuckRig()
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
     rig.send(10)
     assert rig.controller.wrench[0, 0] == 10
@@ -133,11 +131,13 @@ def test_motors_are_never_asked_for_more_than_they_have_nor_for_jumps() -> None:
     assert rig.cerebellum.take_flags()[0][0] & Limit.EFFORT
 
 
-@pytest.mark.parametrize("value", [0.0, 1e-3, 1e200])
-def test_an_invalid_quaternion_stops_the_arm(value: float) -> None:
+@pytest.mark.parametrize("value", [0.0, 1e-3, 1e200, np.nan])
+def test_an_invalid_quaternion_in_the_queue_stops_the_arm(value: float) -> None:
     rig = StuckRig()
-    rig.target[0, 3:7] = (value, 0, 0, 0)
     rig.send()
+    rig.target[0, 3:7] = (value, 0, 0, 0)
+    rig.cerebellum.fifo.push(10**6, rig.now, rig.target, np.ones(1, np.bool_))  # as another process may
+    rig.tick()
     assert rig.mode == Mode.FAULT
     assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
     assert np.isfinite(rig.plant.written).all()
@@ -151,17 +151,6 @@ def test_places_beyond_any_reach_are_clipped() -> None:
     assert rig.cerebellum.take_flags()[0][0] & Limit.POSITION
     assert rig.controller.command[0, 7] == pytest.approx(MAX_OPENING)
     assert np.isfinite(rig.controller.command).all()
-
-
-def test_values_that_are_no_numbers_stop_the_arm() -> None:
-    rig = StuckRig()
-    rig.send()
-    Rig.send(rig, rig.target)
-    rig.cerebellum.fifo.queues["values"][:] = np.nan  # another process may write to it
-    rig.tick()
-    assert rig.mode == Mode.FAULT
-    assert rig.cerebellum.take_flags()[0][0] & Limit.NON_FINITE
-    assert np.isfinite(rig.plant.written[-1]).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
@@ -243,36 +232,30 @@ def test_a_deactivation_brakes_and_ends_in_safe_off() -> None:
     assert rig.mode == Mode.SAFE_OFF
 
 
-def test_a_restart_forgets_the_episode_before() -> None:
+def test_a_restart_forgets_the_episode_before_and_which_limits_were_met() -> None:
     rig = StuckRig()
     rig.controller.set_wrench((10, 0, 0, 0, 0, 0))
-    rig.target[0, 2] += 0.1
+    rig.target[0, 2] += 10.0
     rig.send(10)
+    met = Limit.VELOCITY | Limit.ACCELERATION
+    assert Limit(int(rig.cerebellum.take_flags()[0][0])) & met == met
+    rig.send()
     rig.cerebellum.restart(np.array([0]))
+    assert rig.cerebellum.take_flags()[0].tolist() == [Limit.NONE]
     assert rig.controller.contact_wrench.tolist() == [[0] * 6]
     rig.tick(50)  # not configured: it stays where it is
     np.testing.assert_allclose(rig.controller.command, rig.cerebellum.state(rig.now).measured, atol=1e-9)
     assert not rig.controller.wrench.any()
 
 
-def test_a_restart_forgets_which_limits_were_met() -> None:
-    rig = StuckRig()
-    met = Limit.VELOCITY | Limit.ACCELERATION
-    rig.target[0, 2] += 10.0
-    rig.send()
-    assert Limit(int(rig.cerebellum.take_flags()[0][0])) & met == met
-    rig.send()
-    rig.cerebellum.restart(np.array([0]))
-    assert rig.cerebellum.take_flags()[0].tolist() == [Limit.NONE]
-
-
-def test_a_position_servo_is_refused() -> None:
-    with pytest.raises(ConfigError, match="actuation"):
-        ImpedanceController(ur5(), 1, HZ, 20)
-    with pytest.raises(ConfigError, match="actuation"):
-        ImpedanceController(replace(ARM, arm=replace(ARM.arm, actuation="position")), 1, HZ, 20)
-
-
-def test_too_few_ticks_for_the_estimate_of_contacts_are_refused() -> None:
-    with pytest.raises(ConfigError, match="control_hz is 49"):
-        ImpedanceController(ARM, 1, 49, 1)
+@each_case(
+    ("body", "hz", "message"),
+    [
+        (ur5(), HZ, "actuation"),
+        (replace(ARM, arm=replace(ARM.arm, actuation="position")), HZ, "actuation"),
+        (ARM, 49, "control_hz is 49"),  # too few ticks for the estimate of contacts
+    ],
+)
+def test_a_position_servo_and_too_few_ticks_are_refused(body: Body, hz: int, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ImpedanceController(body, 1, hz, 20)

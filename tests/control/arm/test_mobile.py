@@ -10,6 +10,7 @@ import pytest
 from bhd_lerobot.control.arm.step import Stage
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.messages import Limit, Mode, Request, Setpoint, Watchdog
+from tests.control import arm_rig
 from tests.control.arm_rig import FRAME, HZ, TICK_NS
 from tests.control.mobile_rig import (
     ARM,
@@ -20,7 +21,6 @@ from tests.control.mobile_rig import (
     WHEELS,
     Rig,
     off,
-    posture,
 )
 
 STOP = np.array(DRIVE.limits.stop_deceleration) / HZ
@@ -82,7 +82,9 @@ def test_whatever_stops_a_part_hard_stops_the_other_and_neither_moves_before_it_
     act(rig)
     rig.tick(2)
     assert rig.mode == mode
-    assert int(rig.cerebellum.take_flags()[1][0]) == watchdog
+    limits, watchdogs = rig.cerebellum.take_flags()
+    assert int(watchdogs[0]) == watchdog
+    assert "not finite" not in cause or limits[0] & Limit.NON_FINITE
     seen = [rig.twist]
     while any(seen[-1]):
         rig.tick()
@@ -313,33 +315,44 @@ def test_a_restart_and_a_recovery_leave_wheels_that_stand_and_an_arm_where_it_is
     assert rig.cerebellum.state(rig.now).odometry[0].tolist() == [0, 0, 0]
 
 
-def follow(n: int, robot: int) -> np.ndarray:
+ROBOTS: dict[bool, tuple[Any, Any, int, tuple[float, ...]]] = {
+    False: (arm_rig.Rig, arm_rig.HOME, 6, (1, 1, 1, 1, 1, 1, 0.05)),
+    True: (Rig, HOME, 4, (1, 1, 1, 1, 0.05, 1, 4)),
+}
+"""Of an arm, and of one on a base: the rig, where it is at home, its joints, and how far its commands are spread."""
+
+
+def follow(on_base: bool, n: int, robot: int) -> np.ndarray:
     """Return what is written to a robot whose number among n says nothing of what it does."""
-    rig, rng, rows = Rig(n), np.random.default_rng(robot), []
-    others = [(sim, np.random.default_rng(sim)) for sim in range(n)] if n > 1 else [(0, rng)]
+    make, home, dof, spread = ROBOTS[on_base]
+    rig, rngs, rows = make(n), [np.random.default_rng(sim if n > 1 else robot) for sim in range(n)], []
     for _ in range(50):
-        for sim, own in others:
-            draw, values = own.random(), HOME + own.normal(0, 0.2, 7) * (1, 1, 1, 1, 0.05, 1, 4)
-            mask = np.arange(n) == sim
-            if draw < 0.5:
+        for sim, own in enumerate(rngs):
+            draw, values, one = own.random(), home + own.normal(0, 0.2, 7) * spread, np.array([sim])
+            if draw < 0.45:
                 rig.sequence += 1
-                rig.cerebellum.offer(Setpoint(rig.sequence, rig.now, np.broadcast_to(values, (n, 7))), mask)
-            elif draw < 0.6:
-                rig.go(sim, joint_target=posture(j0=float(values[0])), gripper=0.02, preempt=draw < 0.55)
-            elif draw < 0.63:
-                rig.cerebellum.estop.press(np.array([sim]))
-            elif draw < 0.66:
+                setpoint = Setpoint(rig.sequence, rig.now, np.broadcast_to(values, (n, 7)))
+                rig.cerebellum.offer(setpoint, np.arange(n) == sim)
+            elif draw < 0.55:
+                rig.go(sim, joint_target=tuple(values[:dof].tolist()), gripper=0.02, preempt=draw < 0.5)
+            elif draw < 0.58:
+                rig.cerebellum.estop.press(one)
+            elif draw < 0.61:
                 rig.plant.lie[sim] = {int(own.integers(7)): np.nan}
-            elif draw < 0.75:
+            elif draw < 0.72:
                 rig.plant.lie.pop(sim, None)
+            elif draw < 0.75 and not on_base:
+                rig.cerebellum.restart(one)
+                rig.request(Request.CONFIGURE, one)
             elif draw < 0.92:
                 for request in (Request.RESET, Request.ACTIVATE):
-                    rig.cerebellum.request(request, np.array([sim]))
+                    rig.request(request, one)
         rig.tick(FRAME)
         rows.append(rig.cerebellum.written[robot if n > 1 else 0].copy())
     return np.array(rows)
 
 
 @pytest.mark.parametrize("robot", range(3))
-def test_a_robot_among_others_is_bit_for_bit_the_robot_alone(robot: int) -> None:
-    np.testing.assert_array_equal(follow(3, robot), follow(1, robot))
+@pytest.mark.parametrize("on_base", ROBOTS)
+def test_a_robot_among_others_is_bit_for_bit_the_robot_alone(on_base: bool, robot: int) -> None:
+    np.testing.assert_array_equal(follow(on_base, 3, robot), follow(on_base, 1, robot))

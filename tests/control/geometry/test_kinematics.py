@@ -16,6 +16,7 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics, U
 from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.errors import ConfigError
+from tests.bodies.test_ur import dh_frames
 from tests.cases import each_case
 
 ARM = ur5()
@@ -49,19 +50,9 @@ def moved(pose: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> n
     return there
 
 
-def product(q: np.ndarray) -> np.ndarray:
-    """The frames as the convention defines them."""
-    frames = [np.eye(4)]
-    for angle, a, d, alpha in zip(q, A, D, ALPHA, strict=True):
-        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
-        step = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
-        frames.append(frames[-1] @ np.array(step))
-    return np.array(frames)
-
-
 @given(q=POSTURE)
 def test_frames_are_the_product_of_the_joints(q: np.ndarray) -> None:
-    np.testing.assert_allclose(KINEMATICS.frames(q), product(q), atol=1e-14)
+    np.testing.assert_allclose(KINEMATICS.frames(q), dh_frames(ARM, q), atol=1e-14)
 
 
 def test_jacobian_is_the_derivative() -> None:

@@ -18,7 +18,6 @@ from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
 from bhd_lerobot.control.geometry.inverse_kinematics import ClosedForm
 from bhd_lerobot.control.geometry.kinematics import ArmKinematics
 from bhd_lerobot.control.geometry.numeric_inverse import NumericInverse
-from bhd_lerobot.control.kernels import plain_python
 from bhd_lerobot.sim.chain import chain_from_mjcf
 from tests.control.geometry.arm_models import serial
 
@@ -240,15 +239,3 @@ def test_a_pose_that_cannot_be_taken_says_why(joints: int) -> None:
     assert codes == {ResultCode.JOINT_LIMIT}
     assert "its limits are" in narrow.solve(kinematics.tool(postures(kinematics, 1)[0]), start).message
     assert kinematics.solve(far * np.nan, start).code == ResultCode.NON_FINITE
-
-
-def test_machine_code_finds_the_same_postures_as_python() -> None:
-    kinematics = arm(6)
-    numeric = NumericInverse(kinematics, kinematics.lower, kinematics.upper)
-    for q, start in zip(postures(kinematics, 3), postures(kinematics, 3, 1), strict=True):
-        arguments = kinematics.tool(q), start, np.stack([start, q + 0.1])
-        machine = numeric.descend(*arguments)
-        with plain_python():
-            plain = numeric.descend(*arguments)
-        np.testing.assert_array_equal(machine[0], plain[0])
-        np.testing.assert_array_equal(machine[1], plain[1])

@@ -102,16 +102,6 @@ def test_a_goal_that_preempts_ends_all_others_and_starts_in_motion(fields: dict[
     assert rig.results() == [("c", ResultCode.SUCCEEDED)]
 
 
-def test_a_goal_that_is_sent_again_on_the_way_is_not_later() -> None:
-    goal = {"joint_target": joints(1.6), "max_velocity": 1.0}
-    undisturbed = started(ticks=0, **goal).run()
-    for ticks in range(10, undisturbed, 81):
-        rig = started(ticks=ticks, **goal)
-        rig.go("b", **goal, preempt=True)
-        assert ticks + rig.run() <= undisturbed + 1, f"sent again after {ticks} ticks"
-        assert rig.results() == [("a", ResultCode.PREEMPTED), ("b", ResultCode.SUCCEEDED)]
-
-
 def test_a_goal_that_preempts_a_brake_takes_over_but_never_a_hard_one() -> None:
     rig = started()
     rig.manager.cancel(0, "a")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.motion.command_check import MAX_TOOL_ACCELERATION, MAX_TOOL_SPEED
 from bhd_lerobot.control.motion.line import Line, ToolLimits, along_line
@@ -21,6 +22,7 @@ def test_random_lines_keep_every_limit_and_are_nearly_as_quick_as_one_without_a_
     while len(ratios) < 10:
         goal = KINEMATICS.tool(posture)
         goal[:3, 3] = rng.uniform(*BOX)
+        goal[:3, :3] = goal[:3, :3] @ Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix()
         tool = ToolLimits(MAX_TOOL_SPEED, MAX_TOOL_ACCELERATION)
         motion = along_line(posture, goal, KINEMATICS, (LIMITS, tool), HZ)
         if isinstance(motion, PlanFailure):
@@ -35,15 +37,19 @@ def test_random_lines_keep_every_limit_and_are_nearly_as_quick_as_one_without_a_
         assert np.allclose(np.diff(velocity, axis=0) * HZ, (acceleration[1:] + acceleration[:-1]) / 2, atol=0.05)
         assert not velocity[-1].any()
         assert not acceleration[-1].any()
-        # On the line, only forward, and no faster than the tool may be.
-        tools = KINEMATICS.tool(position)[:, :3, 3] - line.start[:3, 3]
+        # On the line, only forward, turning evenly, and no faster than the tool may be.
+        frames, turn = KINEMATICS.tool(position), line.start[:3, :3].T
+        assert np.abs(frames[-1] - goal).max() < 1e-9
+        tools = frames[:, :3, 3] - line.start[:3, 3]
         way = (goal[:3, 3] - line.start[:3, 3]) / line.length
         assert np.linalg.norm(tools - np.outer(tools @ way, way), axis=1).max() < 3e-5
         along = np.diff(tools @ way) * HZ
         assert along.min() > -1e-6
         assert along.max() <= MAX_TOOL_SPEED + 1e-6
-        assert np.abs(tools[-1] - way * line.length).max() < 1e-9
+        assert np.abs(np.diff(along, prepend=0.0)).max() * HZ <= MAX_TOOL_ACCELERATION * 1.01 + 1e-3
         share = tools @ way / line.length
+        turned, whole = (Rotation.from_matrix(turn @ one[..., :3, :3]).as_rotvec() for one in (frames, goal))
+        assert np.abs(turned - share[:, None] * whole).max() < 1e-4
         kept = np.concatenate(((True,), np.diff(share) > 1e-9))
         ratios.append(motion.ticks / HZ / bound(share[kept], position[kept]))
         posture = motion.target

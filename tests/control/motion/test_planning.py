@@ -12,7 +12,7 @@ from bhd_lerobot.bodies.body import Capsule
 from bhd_lerobot.control.arm.controller import ArmController
 from bhd_lerobot.control.commands import BrainCommand, GoalPhase, ResultCode
 from bhd_lerobot.control.motion.planner import GoalPlanner, Plan
-from bhd_lerobot.control.motion.planning import MIN_LEAD, MOST_LEADS, InlinePlanning, lead_ticks
+from bhd_lerobot.control.motion.planning import MIN_LEAD, MOST_LEADS, lead_ticks
 from bhd_lerobot.control.motion.trajectory import PlanFailure, State
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError
@@ -242,15 +242,6 @@ def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     rig = Rig(planning=planning)
     end(rig, follow(rig, 0, script))
     assert planning.out == {}
-
-
-@settings(max_examples=15)
-@given(st.lists(actions, min_size=1, max_size=5))
-def test_inline_planning_is_the_default(script: list) -> None:
-    plain, inline = Rig(), Rig(planning=InlinePlanning(PLANNER))
-    assert follow(plain, 0, script) == follow(inline, 0, script)
-    assert np.array_equal(plain.history, inline.history)
-    assert plain.manager.take_results(0) == inline.manager.take_results(0)
 
 
 @each_case("preempt", [False, True])

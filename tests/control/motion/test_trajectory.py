@@ -6,10 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import ruckig
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bhd_lerobot.control.commands import ResultCode
 from bhd_lerobot.control.kernels import as_objects
@@ -208,33 +207,6 @@ def test_non_finite_numbers_return_a_failure(bad: float) -> None:
         assert answer.message
 
 
-@settings(max_examples=20)
-@given(*[st.floats(-1, 1)] * 4)
-def test_the_tool_stays_on_the_line_and_turns_evenly(x: float, y: float, z: float, turn: float) -> None:
-    goal = moved(0.2 * x, 0.3 * y, 0.15 * z, turn).matrix()
-    answer = along_line(HOME[:6], goal, KINEMATICS, (ARM, TOOL_LIMITS), HZ)
-    assume(not (isinstance(answer, PlanFailure) and answer.code == ResultCode.UNREACHABLE))
-    trajectory = planned(answer)
-    assert excess(State.at_rest(HOME[:6]), trajectory, ARM) < 1e-9
-    assert not trajectory.velocity[-1].any()
-    tools = KINEMATICS.tool(trajectory.position)
-    assert np.abs(tools[-1] - goal).max() < 1e-9
-    way = goal[:3, 3] - TOOL[:3, 3]
-    length = float(np.linalg.norm(way))
-    if length < 1e-3:
-        return
-    along = (tools[:, :3, 3] - TOOL[:3, 3]) @ way / length
-    beside = tools[:, :3, 3] - TOOL[:3, 3] - along[:, None] * way / length
-    assert np.linalg.norm(beside, axis=1).max() < 5e-5
-    assert (np.diff(along) > -1e-9).all()
-    turned = Rotation.from_matrix(TOOL[:3, :3].T @ tools[:, :3, :3]).as_rotvec()
-    even = along[:, None] / length * Rotation.from_matrix(TOOL[:3, :3].T @ goal[:3, :3]).as_rotvec()
-    assert np.abs(turned - even).max() < 1e-4
-    speed = np.diff(along, prepend=0.0) * HZ
-    assert speed.max() <= TOOL_LIMITS.velocity + 1e-6
-    assert np.abs(np.diff(speed, prepend=0.0)).max() * HZ <= TOOL_LIMITS.acceleration * 1.01 + 1e-3
-
-
 def test_a_line_keeps_the_jerk_of_joints_that_must_move_gently() -> None:
     gentle = dataclasses.replace(ARM, jerk=ARM.jerk / 5)
     random = np.random.default_rng(0)
@@ -334,38 +306,12 @@ def rows_of(ticks: int, seed: int = 0, dof: int = 2) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(ticks, 3, dof))
 
 
-def equal(state: State | None, row: np.ndarray) -> bool:
-    return state is not None and np.array_equal((state.position, state.velocity, state.acceleration), row)
-
-
-@given(st.integers(1, 20), st.integers(0, 19), st.integers(1, 30), st.booleans())
-def test_ahead_matches_later_playback(ticks: int, played: int, ahead: int, borrowed: bool) -> None:
-    player, rows = Played(1), rows_of(ticks)
-    player.start(0, numbered(5, 1.0))
-    player.tick()
-    if borrowed:
-        player.borrow(rows)
-    else:
-        player.start(0, Trajectory(rows[:, 0], rows[:, 1], rows[:, 2]))
-    for _ in range(played):
-        player.tick()
-    if played >= ticks:
-        assert player.ahead(0, ahead) is None
-        assert not player.is_playing(0)
-        return
-    state = player.ahead(0, ahead)
-    assert equal(state, rows[min(played + ahead, ticks) - 1])
-    last = player.tick()
-    for _ in range(min(ahead, ticks - played) - 1):
-        last = player.tick()
-    assert equal(state, last[:, 0])
-
-
 def test_borrowed_rows_are_played_where_they_lie() -> None:
     player, rows = Played(1), rows_of(6)
     player.borrow(rows)
     state = player.ahead(0, 2)
     assert state is not None
+    assert np.array_equal((state.position, state.velocity, state.acceleration), rows[1])
     state.position[:] = 9.0  # of a copy
     assert (rows != 9.0).all()
     assert player.remaining(0) == 6
