@@ -90,7 +90,7 @@ def stop_at(
 def test_a_base_that_follows_within_its_latency_is_never_blocked(
     latency: float, motor: float, read_hz: float, seed: int
 ) -> None:
-    assert stop_at(20, latency=latency, motor=motor, read_hz=read_hz, seed=seed)[0] == np.inf
+    assert stop_at(10, latency=latency, motor=motor, read_hz=read_hz, seed=seed)[0] == np.inf
 
 
 @each_case("silence", [0.3, 0.35, 0.4, 0.45])

@@ -96,13 +96,6 @@ def test_a_method_is_called_where_the_indices_say_and_nowhere_else(four: Any, mo
         four.set_attr("render_mode", None, indices=[0])
 
 
-def test_an_episode_that_cannot_be_told_from_another_is_not_shared(four: Any) -> None:
-    four.reset()
-    *_, infos = four.step(np.zeros((4, 2), np.float32))
-    infos[0]["mine"] = True
-    assert all("mine" not in info for info in infos[1:])
-
-
 def test_it_is_rendered_from_any_thread(four: Any) -> None:
     four.reset()
     assert four.render_mode == "rgb_array"

@@ -48,7 +48,11 @@ class Bench:
     ) -> dict[int, BrainCommand]:
         """Let the brain see the simulations; return the new goals."""
         environment = self.environment.reshape(self.n, -1)
-        goals = self.brain.act(Observation(self.observed, self.state, {}, environment, results or {}, running))
+        return self.show(Observation(self.observed, self.state, {}, environment, results or {}, running))
+
+    def show(self, observation: Observation) -> dict[int, BrainCommand]:
+        """Let the brain see this; return the new goals."""
+        goals = self.brain.act(observation)
         assert isinstance(goals, Goals)
         new = {}
         for sim, commands in goals.commands.items():

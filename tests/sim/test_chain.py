@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bhd_lerobot.bodies.body import Arm, Placement
-from bhd_lerobot.bodies.ur import MODELS, ur
+from bhd_lerobot.bodies.body import Placement
 from bhd_lerobot.control.geometry.capsules import left_out
 from bhd_lerobot.control.geometry.collision import CollisionModel
 from bhd_lerobot.control.geometry.forward_kinematics import ForwardKinematics
@@ -72,16 +71,6 @@ def test_frames_and_jacobian_are_those_of_the_engine(joints: int, degree: bool, 
         mine = mount[:3, :3] @ forward.jacobian(q).reshape(2, 3, joints)
         np.testing.assert_allclose(mine, jacobian[:, :, :joints], atol=1e-12)
         assert np.linalg.norm(forward.tool(q)[:3, 3]) < chain.reach
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_the_frames_of_a_ur_are_its_own(name: str) -> None:
-    body = ur(name)
-    own, read = ForwardKinematics(body.need(Arm).chain), ForwardKinematics(chain_from_mjcf(body.mjcf, "tool"))
-    postures = RNG.uniform(-np.pi, np.pi, (50, 6))
-    np.testing.assert_allclose(read.tool(postures), own.tool(postures), atol=1e-12)
-    np.testing.assert_allclose(read.jacobian(postures), own.jacobian(postures), atol=1e-12)
-    np.testing.assert_allclose(read.manipulability(postures), own.manipulability(postures), atol=1e-12)
 
 
 def test_a_root_farther_out_leaves_out_the_joints_before_it() -> None:

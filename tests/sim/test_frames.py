@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
@@ -10,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.arenas import make_arena
-from bhd_lerobot.bodies.body import Arm
 from bhd_lerobot.control import kernels
-from bhd_lerobot.control.commands import BrainCommand, Goals, Pose
+from bhd_lerobot.control.commands import BrainCommand, Goals
 from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.errors import SimulationError
 from bhd_lerobot.robots.config_arm import SO101Config
@@ -56,197 +56,110 @@ def tick_alone(simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridge, "advance_ticks", advance_ticks)
 
 
-def run(
-    n: int, threads: int | None = None, alone: pytest.MonkeyPatch | None = None, **options: Any
+KINDS: dict[str, tuple[type, dict[str, Any]]] = {
+    "base": (TurtleBot3Config, {"odometry": True}),
+    "base that keeps clear": (TurtleBot3Config, {"imu": True, "collision_monitor": True}),
+    "base of three steps a tick": (TurtleBot3Config, {"physics_hz": 600}),
+    "base that is ticked seldom": (TurtleBot3Config, {"physics_hz": 100, "control_hz": 50}),
+    "arm": (UR5Config, {}),
+    "arm that tells a wrench, of two steps a tick": (UR5Config, {"wrench": True, "physics_hz": 1000}),
+    "arm of little force": (UR5Config, {"max_force": 30.0, "jerk_limits": False}),
+    "impedance": (UR5Config, {"control": "impedance", "action_space": "tool"}),
+    "arm on a base": (TurtleBot3ManipulationConfig, {"imu": True, "collision_monitor": True, "arena": "random"}),
+    "arm from a file": (SO101Config, {}),
+    "arm that is ticked seldom": (SO101Config, {"control_hz": 100, "fps": 10, "jerk_limits": False}),
+}
+
+
+def scenes_of(config: Any) -> Callable[[int], Any]:
+    """Return what makes a robot's scene of a seed."""
+    if isinstance(config, TurtleBot3Config):
+        return lambda seed: make_arena("random", seed, robot_radius=0.105)
+    if isinstance(config, UR5Config):
+        late = RandomisationConfig(enabled=True, latency_s=0.01)
+        return PickTask(PickConfig(randomisation=late), 1, config.fps, config.body()).sample
+    return lambda _: config.start_scene()
+
+
+def next_action(config: Any, last: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return a base's next twist, or where an arm goes on to from its last action: down, sooner or later."""
+    if isinstance(config, TurtleBot3Config):
+        return rng.uniform(-1, 1, 2) * (0.3, 3.0)
+    by, lean = (0.01, (2, -0.01)) if config.control == "impedance" else (0.06, (1, 0.05))
+    change = rng.uniform(-by, by, len(last))
+    change[3:] *= config.control != "impedance"  # of a pose: as it is turned, it stays
+    change[lean[0]] += lean[1]
+    return last + change
+
+
+def play(
+    config: Any, n: int, threads: int | None = None, alone: pytest.MonkeyPatch | None = None
 ) -> NDArray[np.float64]:
-    """Return everything that is observed, reported and true of bases that run into things, stop, and go on."""
-    simulation, rng, rows = make(n, threads, **options), np.random.default_rng(0), []
+    """Return everything that is observed, reported and true of robots that run into things, stop, and go on.
+
+    The first stops hard, the second is left alone and begins anew, arms that take goals follow one in between.
+    """
+    robots, scene, ids, rows = Simulation(config, n, threads), scenes_of(config), np.arange(n), []
     if alone is not None:
-        tick_alone(simulation, alone)
-    friction = simulation.world.model_field("geom_friction")
+        tick_alone(robots, alone)
+    robots.reset(ids, [scene(sim) for sim in range(n)], ids.tolist())
+    rngs = [np.random.default_rng(sim) for sim in range(n)]
+    friction, arm = robots.world.model_field("geom_friction"), robots.body.arm
+    takes_goals = arm is not None and config.control != "impedance"
+    command = robots.cerebellum.command
+    action = command.copy()
     for frame in range(FRAMES):
-        if frame == 8:
-            simulation.estop()
-        if frame == 12:
-            simulation.bridge.reset()
-            simulation.bridge.activate()
-        if frame == 16:
+        if frame == 11:
+            robots.bridge.estop(ids[:1])
+        if frame == 15:
+            robots.bridge.reset()
+            robots.bridge.activate()
+            action[:] = command
+        if frame == 17:
             friction[:, :, 0] *= 0.3  # written to between two frames: it counts from the next step on
-            simulation._frames.forget()
-        if frame == 20 and n > 1:
-            simulation.stop(np.array([1]))
-        if frame == 24 and n > 1:
-            simulation.reset(np.array([1]), [make_arena("random", 9, robot_radius=0.105)], [9])
-        report = simulation.step(rng.uniform(-1, 1, (n, 2)) * (0.3, 3.0))
-        seen, pose = simulation.observe(), simulation.truth()
-        flags = np.stack([report.limits, report.watchdog, report.mode, seen.age_ns, pose.touched], axis=1)
-        efforts = report.columns["control.effort"]
-        every = np.concatenate([seen.state, report.applied, flags, efforts, simulation.physics_state], axis=1)
-        rows.append(np.where(simulation.running[:, None], every, 0.0))  # of robots that were left alone nothing is said
-    assert alone is None or simulation._frames._is_prepared
-    simulation.close()
+            robots._frames.forget()
+        if frame == 19 and n > 1:
+            robots.stop(ids[1:2])
+        if frame == 23 and n > 1:
+            robots.reset(ids[1:2], [scene(9)], [9])
+            action[1] = command[1]
+        told: Any = action
+        if takes_goals and frame in (2, 24):
+            postures = command[:, : arm.chain.dof] + (np.arange(arm.chain.dof) == 0) * 0.4
+            goals = [BrainCommand(str(frame), joint_target=tuple(one), gripper=0.02) for one in postures.tolist()]
+            told = Goals({sim: (goal,) for sim, goal in enumerate(goals)})
+        elif takes_goals and frame in (*range(3, 7), *range(25, FRAMES)):
+            told = None  # they go on with it
+        else:
+            action[:] = [next_action(config, *one) for one in zip(action, rngs, strict=True)]
+        report, seen, true = robots.step(told), robots.observe(), robots.truth()
+        flags = np.stack([report.limits, report.watchdog, report.mode, seen.age_ns], axis=1)
+        every = [seen.state, report.applied, flags, report.columns["control.effort"], robots.cerebellum.written]
+        every += [robots.physics_state, *(field.reshape(n, -1) for field in vars(true).values())]
+        if takes_goals:
+            every.append(np.array([[len(robots.bridge.take_results(sim))] for sim in range(n)]))
+        rows.append(
+            np.where(robots.running[:, None], np.concatenate(every, axis=1), 0.0)
+        )  # those apart: nothing
+    assert alone is None or robots._frames._is_prepared
+    robots.close()
     return np.array(rows)
 
 
-@each_case(
-    "options",
-    [{}, {"imu": True, "collision_monitor": True}, {"physics_hz": 600}, {"physics_hz": 100, "control_hz": 50}],
-)
-@pytest.mark.parametrize(("n", "threads"), [(1, None), (5, 1), (5, 3)])
-def test_frames_are_the_bits_of_ticks_and_steps_in_turns(
-    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], n: int, threads: int | None
-) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_are_the_bits_of_ticks_and_steps_in_turns(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """For any share of threads; alone, tick by tick as on the wall clock; and in plain Python."""
+    make_config, options = KINDS[kind]
     if options.get("physics_hz") == 100:
         monkeypatch.setattr("bhd_lerobot.bodies.body.Body.check_rates", lambda *_, **__: None)
-    calls = count_calls(monkeypatch)
-    fast = run(n, threads, **options)
-    assert calls
-    if n == 1:
-        np.testing.assert_array_equal(run(1, alone=monkeypatch, **options), fast)
+    config, calls = make_config(**options), count_calls(monkeypatch)
+    fast = play(config, 4, threads=3)
+    assert len(calls) >= FRAMES
+    np.testing.assert_array_equal(play(config, 4, threads=1), fast)
+    np.testing.assert_array_equal(play(config, 1, alone=monkeypatch), fast[:, :1])
     with kernels.plain_python():
         calls.clear()
-        plain = run(n, threads, **options)
-        assert not calls
-    np.testing.assert_array_equal(fast, plain)
-
-
-class Reacher:
-    """What arms are told to do: by setpoints, by goals, and something else in between."""
-
-    def __init__(
-        self, n: int, threads: int | None, options: dict[str, Any], alone: pytest.MonkeyPatch | None = None
-    ) -> None:
-        config = UR5Config(**options)
-        self.arm = Simulation(config, n, threads)
-        self.alone = alone is not None
-        if alone is not None:
-            tick_alone(self.arm, alone)
-        self.task = PickTask(
-            PickConfig(randomisation=RandomisationConfig(enabled=True, latency_s=0.01)), n, config.fps, config.body()
-        )
-        self.all, self.rng = np.arange(n), np.random.default_rng(0)
-        self.arm.reset(self.all, [self.task.sample(sim) for sim in range(n)], self.all.tolist())
-        self.action = self.arm.cerebellum.command.copy()
-
-    def disturb(self, frame: int) -> None:
-        """Stop, reset, leave alone and start again."""
-        bridge, n = self.arm.bridge, len(self.all)
-        if frame == 20:
-            bridge.estop(self.all[:1])
-        if frame == 26:
-            bridge.reset()
-            bridge.activate()
-            self.action[:] = self.arm.cerebellum.command
-        if frame == 30 and n > 1:
-            self.arm.stop(np.array([1]))
-        if frame == 34 and n > 1:
-            self.arm.reset(np.array([1]), [self.task.sample(7)], [7])
-            self.action[:] = self.arm.cerebellum.command
-
-    def run(self) -> NDArray[np.float64]:
-        rows, by_pose = [], self.arm.config.control == "impedance"
-        for frame in range(44):
-            self.disturb(frame)
-            goals: dict[int, tuple[BrainCommand, ...]] = {}
-            if not by_pose and frame in (2, 12, 13, 36):
-                pose = Pose((0.5, 0.1 - 0.01 * frame, 0.2), (0.0, 1.0, 0.0, 0.0))
-                opening = 0.02 if frame == 13 else 0.08
-                goals = {sim: (BrainCommand(f"{frame}", target_pose=pose, gripper=opening),) for sim in self.all}
-            is_goal = bool(goals) or frame in range(2, 8) or frame in range(12, 20) or frame > 36
-            if by_pose:
-                self.action[:, :3] += self.rng.uniform(-0.01, 0.01, (len(self.all), 3)) - (0.0, 0.0, 0.01)
-                report = self.arm.step(self.action)
-            elif is_goal:
-                report = self.arm.step(Goals(goals))
-            else:
-                self.action[:, :6] += self.rng.uniform(-0.06, 0.06, (len(self.all), 6)) - (0.0, 0.05, 0, 0, 0, 0)
-                report = self.arm.step(self.action)
-            seen, true = self.arm.observe(), self.arm.truth()
-            touches = np.stack([true.arm_on_table, true.arm_on_object, true.self_contact], axis=1)
-            flags = np.stack([report.limits, report.watchdog, report.mode], axis=1)
-            results = [[len(self.arm.bridge.take_results(int(sim)))] for sim in self.all]
-            every = [seen.state, report.applied, flags, touches, report.columns["control.effort"], results]
-            every += [true.tool_pose, self.arm.physics_state]
-            row = np.concatenate(every, axis=1)
-            rows.append(np.where(self.arm.running[:, None], row, 0.0))
-        assert not self.alone or self.arm._frames._is_prepared
-        self.arm.close()
-        return np.array(rows)
-
-
-@each_case(
-    "options",
-    [
-        {},
-        {"wrench": True},
-        {"physics_hz": 1000},
-        {"max_force": 30.0, "jerk_limits": False},
-        {"control": "impedance", "action_space": "tool"},
-    ],
-)
-@pytest.mark.parametrize(("n", "threads"), [(1, None), (4, 1), (4, 3)])
-def test_frames_of_arms_are_the_bits_of_ticks_and_steps_in_turns(
-    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], n: int, threads: int | None
-) -> None:
-    calls = count_calls(monkeypatch)
-    fast = Reacher(n, threads, options).run()
-    assert len(calls) >= 44
-    if n == 1:
-        np.testing.assert_array_equal(Reacher(1, threads, options, monkeypatch).run(), fast)
-    with kernels.plain_python():
-        calls.clear()
-        plain = Reacher(n, threads, options).run()
-        assert not calls
-    np.testing.assert_array_equal(fast, plain)
-
-
-def wander(config: Any, n: int, alone: pytest.MonkeyPatch | None = None) -> NDArray[np.float64]:
-    """Return what arms observe, write and report that follow setpoints and goals, stop, and go on."""
-    robots, rng, rows = Simulation(config, n), np.random.default_rng(0), []
-    if alone is not None:
-        tick_alone(robots, alone)
-    robots.reset(np.arange(n), [config.start_scene()] * n, list(range(n)))
-    cerebellum, dof = robots.cerebellum, len(robots.body.need(Arm).chain.joints)
-    action, posture = cerebellum.command.copy(), tuple((cerebellum.command[0, :dof] + 0.3).tolist())
-    for frame in range(20):
-        action += rng.uniform(-0.1, 0.1, (2, action.shape[1]))[:n]
-        command: Any = action
-        if frame == 3:
-            command = Goals({sim: (BrainCommand("a", joint_target=posture, gripper=0.01),) for sim in range(n)})
-        elif 3 < frame < 8:
-            command = None
-        elif frame == 12:
-            robots.estop()
-        elif frame == 17:
-            robots.bridge.reset()
-            robots.bridge.activate()
-        report = robots.step(command)
-        flags = np.stack([report.limits, report.watchdog, report.mode], axis=1)
-        rows.append([robots.observe().state, report.applied, cerebellum.written.copy(), flags, robots.physics_state])
-    assert alone is None or robots._frames._is_prepared
-    robots.close()
-    return np.array([np.concatenate(row, axis=1) for row in rows])
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        TurtleBot3ManipulationConfig(beams=90, imu=True, collision_monitor=True, arena="random"),
-        SO101Config(),
-        SO101Config(control_hz=100, fps=10, jerk_limits=False),
-    ],
-    ids=["on a base", "from a file", "seldom"],
-)
-def test_frames_of_arms_on_bases_and_from_files_are_the_bits_of_ticks_and_steps_in_turns(
-    monkeypatch: pytest.MonkeyPatch, config: Any
-) -> None:
-    calls = count_calls(monkeypatch)
-    fast = wander(config, 2)
-    assert calls
-    np.testing.assert_array_equal(wander(config, 1, monkeypatch), fast[:, :1])
-    with kernels.plain_python():
-        calls.clear()
-        np.testing.assert_array_equal(fast, wander(config, 2))
+        np.testing.assert_array_equal(play(config, 2), fast[:, :2])
         assert not calls
 
 

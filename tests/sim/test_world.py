@@ -12,7 +12,6 @@ from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import ConfigError, SimulationError
-from bhd_lerobot.sim.lidar import Lidar
 from bhd_lerobot.sim.plant import SimulatedPlant
 from bhd_lerobot.sim.tabletop import Tabletop
 from bhd_lerobot.sim.world import World, mujoco_batch
@@ -20,7 +19,7 @@ from tests.cases import each_case
 
 BODY = turtlebot3_burger()
 RADIUS, SEPARATION = 0.033, 0.160
-PHYSICS_HZ = pytest.mark.parametrize("physics_hz", [200, 400, 1000])
+PHYSICS_HZ = pytest.mark.parametrize("physics_hz", [200, 1000])
 
 
 def wheel_speeds(speed: float, yaw_rate: float) -> tuple[float, float]:
@@ -96,17 +95,6 @@ def test_an_episode_does_not_depend_on_the_one_before(many: list[bytes]) -> None
     assert all(expected.startswith(state) for state, expected in zip(states, many, strict=False))
 
 
-def test_steps_may_be_split() -> None:
-    at_once, split = World(BODY, 2), World(BODY, 2)
-    for world in (at_once, split):
-        fill(world, range(2))
-        world.ctrl[:] = (5.0, -3.0)
-    at_once.step(30)
-    for k in (1, 4, 25):
-        split.step(k)
-    assert [everything(at_once, sim) for sim in range(2)] == [everything(split, sim) for sim in range(2)]
-
-
 def test_only_the_simulations_named_are_stepped() -> None:
     world, reference = World(BODY, 5), World(BODY, 5)
     for each in (world, reference):
@@ -114,7 +102,8 @@ def test_only_the_simulations_named_are_stepped() -> None:
         each.ctrl[:] = 4.0
     before = [everything(world, sim) for sim in range(5)]
     world.step(10, np.array([1, 4]))
-    reference.step(10)
+    for steps in (1, 4, 5):  # in as many steps
+        reference.step(steps)
     for sim in range(5):
         assert everything(world, sim) == (everything(reference, sim) if sim in (1, 4) else before[sim])
     world.step(10, np.array([], np.intp))
@@ -178,9 +167,11 @@ def test_a_snapshot_of_some_can_be_restored_into_others() -> None:
     assert everything(world, 2) == everything(world, 3)
 
 
-def test_a_snapshot_holds_randomised_model_fields_and_what_derives_from_them() -> None:
-    world = World(BODY, 3)
-    fill(world, range(3))
+def test_a_snapshot_holds_randomised_model_fields_and_undoes_those_that_came_later() -> None:
+    world, fresh = World(BODY, 3), World(BODY, 3)
+    for each in (world, fresh):
+        fill(each, range(3))
+    before = world.snapshot()
     world.model_field("geom_friction")[:, :, 0] *= np.array([0.2, 0.5, 1.0])[:, None]
     world.model_field("body_mass")[:] *= np.array([0.7, 1.0, 1.6])[:, None]
     world.model_field("opt.gravity")[:, 2] = (-9.0, -9.81, -10.0)
@@ -194,22 +185,10 @@ def test_a_snapshot_holds_randomised_model_fields_and_what_derives_from_them() -
         target.restore(snapshot)
         roam(target, range(3), 10)
         assert [target.snapshot([sim]).state.tobytes() for sim in range(3)] == expected
-
-
-def test_a_snapshot_from_before_a_randomisation_undoes_it() -> None:
-    world, reference = World(BODY, 2), World(BODY, 2)
-    for each in (world, reference):
-        fill(each, range(2))
-    snapshot = world.snapshot()
-    world.model_field("geom_friction")[:] = 0.01
-    world.model_field("opt.gravity")[:] = (0.0, 0.0, -1.0)
-    world.model_field("body_mass")[:] *= 3.0
-    world.update_constants()
-    roam(world, range(2), 3)
-    world.restore(snapshot)
-    for each in (world, reference):
-        roam(each, range(2))
-    assert world.snapshot().state.tobytes() == reference.snapshot().state.tobytes()
+    world.restore(before)
+    for each in (world, fresh):
+        roam(each, range(3))
+    assert world.snapshot().state.tobytes() == fresh.snapshot().state.tobytes()
 
 
 POST = Shape("cylinder", 1.0, 0.0, 0.0, 0.1, 0.1)
@@ -375,20 +354,6 @@ def test_diverged_physics_is_an_error_that_names_the_simulation(broken: float) -
     world.check()
     world.step(5)
     world.check()
-
-
-def test_images_and_scans_do_not_disturb_the_physics() -> None:
-    world, reference = World(BODY, 2), World(BODY, 2)
-    for each in (world, reference):
-        fill(each, range(2))
-    assert BODY.lidar is not None
-    lidar = Lidar(world, BODY.lidar)
-    for _ in range(5):
-        lidar.scan([np.random.default_rng(sim) for sim in range(2)])
-        for each in (world, reference):
-            each.ctrl[:] = (5.0, 4.0)
-            each.step(10)
-    assert [everything(world, sim) for sim in range(2)] == [everything(reference, sim) for sim in range(2)]
 
 
 TOOL = '<site name="tool" pos="0 0 0.150"'

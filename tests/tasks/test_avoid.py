@@ -40,25 +40,16 @@ def on_circle(frame: int, speed: float) -> np.ndarray:
     return np.array([[math.sin(angle), 1 - math.cos(angle)]])
 
 
-def test_success_needs_the_whole_time_and_the_path() -> None:
-    run = Run(AvoidConfig(duration_s=20.0))
-    for frame in range(1, 200):
-        run.frame(on_circle(frame, 0.2))
-        assert run.running[0]
-    run.frame(on_circle(200, 0.2))
-    outcome = run.outcome()
-    assert (run.events[0], outcome.success, outcome.event) == (Event.SUCCESS, True, Event.SUCCESS)
-    assert run.frames[0] == 200
-    assert outcome.details["path_m"] == pytest.approx(4.0, rel=1e-3)  # chords of arcs
-
-
-@pytest.mark.parametrize(("speed", "event"), [(0.152, Event.SUCCESS), (0.148, Event.TIMEOUT)])
-def test_too_short_a_path_is_a_time_out(speed: float, event: Event) -> None:
+@each_case(("speed", "event"), [(0.2, Event.SUCCESS), (0.152, Event.SUCCESS), (0.148, Event.TIMEOUT)])
+def test_success_needs_the_whole_time_and_too_short_a_path_is_a_time_out(speed: float, event: Event) -> None:
     run = Run(AvoidConfig(duration_s=20.0))
     for frame in range(1, 201):
+        assert run.running[0]
         run.frame(on_circle(frame, speed))
-    assert run.events[0] == event
-    assert run.outcome().success == (event == Event.SUCCESS)
+    outcome = run.outcome()
+    assert (run.events[0], outcome.success, outcome.event) == (event, event == Event.SUCCESS, event)
+    assert run.frames[0] == 200
+    assert outcome.details["path_m"] == pytest.approx(20.0 * speed, rel=1e-3)  # chords of arcs
 
 
 def test_the_path_is_walked_not_the_way_from_the_start() -> None:

@@ -20,6 +20,7 @@ from bhd_lerobot.policies.baselines import RandomBrain, RandomConfig
 from bhd_lerobot.policies.language.language_brain import LanguageBrainConfig
 from bhd_lerobot.policies.manipulation.pick import PickBrainConfig
 from bhd_lerobot.policies.manipulation.reach import ReachBrainConfig
+from bhd_lerobot.policies.manipulation.servo import ServoConfig
 from bhd_lerobot.recording.config import RecordConfig
 from bhd_lerobot.robots.config_ur import UR5Config
 from bhd_lerobot.robots.host.simulation import Simulation
@@ -159,6 +160,7 @@ def test_what_no_calibration_is_off_by_is_refused_for_the_task_and_for_the_rules
         (ReachBrainConfig, "brain"),
         (PickBrainConfig, "brain"),
         (LanguageBrainConfig, "brain"),
+        (ServoConfig, "brain"),
     ):
         message = rf"^{name}.camera_error_m is {re.escape(str(list(error)))}; it must be three numbers, .* -0.2 and 0.2"
         with pytest.raises(ConfigError, match=message):

@@ -56,9 +56,8 @@ def test_forces_are_estimated_and_compared_with_the_largest() -> None:
     assert not felt.arms["presses"][2]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_forces_in_random_postures_and_directions_are_found_as_the_page_says(seed: int) -> None:
-    rng, kinematics = np.random.default_rng(seed), ArmKinematics(ARM.arm.chain, ARM.limits)
+def test_forces_in_random_postures_and_directions_are_found_as_the_page_says() -> None:
+    rng, kinematics = np.random.default_rng(0), ArmKinematics(ARM.arm.chain, ARM.limits)
     postures = np.array(ARM.arm.home)[:6] + rng.uniform(-1.5, 1.5, (1000, 6))
     free = np.min(kinematics.collision.distances(postures), axis=0) > 0.02
     postures = np.repeat(postures[free][:60], 8, axis=0)

@@ -97,13 +97,13 @@ def test_no_stream_of_setpoints_breaks_a_limit(script: list, frame: int) -> None
 
 
 @pytest.mark.law
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(st.integers(0, 2**32 - 1))
 def test_no_jitter_near_the_ends_of_the_range_breaks_a_limit(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    shape = (10, 7)  # many arms side by side cost little more than one
+    shape = (4, 7)
     stream = Stream(shape[0], start=np.where(rng.random(shape) < 0.5, LOWER, UPPER))
-    for _ in range(30):
+    for _ in range(20):
         stream.frame(np.where(rng.random(shape) < 0.5, LOWER, UPPER) + rng.normal(0, 0.02, shape))
     stream.check()
 

@@ -8,13 +8,13 @@ import pytest
 
 from bhd_lerobot.bodies.tabletop import COLOURS, TableObject
 from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
-from bhd_lerobot.control.commands import BrainCommand, CommandResult, Goals, ResultCode
+from bhd_lerobot.control.commands import BrainCommand
 from bhd_lerobot.errors import ConfigError, InstructionError, PerceptionError
-from bhd_lerobot.policies.brain import Observation, RobotFeatures
+from bhd_lerobot.policies.brain import Observation
 from bhd_lerobot.policies.language.language_brain import LanguageBrain, LanguageBrainConfig
 from bhd_lerobot.policies.perception.perceiver import PerceivedObject, PerceptionOptions
 from tests.cases import each_case
-from tests.policies.arm_desk import BOX, CUP, OBSERVED
+from tests.policies.arm_desk import BOX, CUP, OBSERVED, Bench
 
 
 def seen(thing: TableObject, index: int, *, off: float = 0.0, error: float = 0.005, certainty: float = 0.95) -> Any:
@@ -64,53 +64,40 @@ class Forbidden:
     __hash__ = None  # type: ignore[assignment]
 
 
-class Table:
+class Table(Bench):
     """One arm, its brain, and a camera. Reading what the task tells fails."""
 
     def __init__(self, *looks: Any, instruction: str = "pick up the red cup", frozen: bool = False, **options: Any):
-        config = LanguageBrainConfig(perception=PerceptionOptions(**options))
-        self.brain = LanguageBrain(config)
-        self.eyes = Eyes(*looks)
-        self.brain.perceiver = self.eyes  # type: ignore[assignment]
-        self.brain.bind(RobotFeatures(OBSERVED, OBSERVED, 25, (), body=ur5()))
-        assert self.brain.uses_images
-        assert not self.brain.uses_privileged_state
-        self.brain.reset(np.array([0]), [0], 1, [instruction])
-        self.given: list[BrainCommand] = []
+        brain = LanguageBrain(LanguageBrainConfig(perception=PerceptionOptions(**options)))
+        self.eyes = brain.perceiver = Eyes(*looks)  # type: ignore[assignment]
+        super().__init__(brain, np.zeros((1, 0)), ())
+        self.begin([instruction])
+        assert brain.uses_images
+        assert not brain.uses_privileged_state
         self.opening, self.images_wanted = MAX_OPENING, []
         self.freezes_after = 1 if frozen else None
         self._random = np.random.default_rng(0)
         self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
 
-    def frame(self, result: CommandResult | None = None) -> BrainCommand | None:
+    def look(self, results: Any = None, running: Any = None) -> dict[int, BrainCommand]:
         """Let the brain act; images are there if it asked for them."""
-        results = {0: [result]} if result else {}
-        wanted = bool(self.brain.needs_images(results)[0])
+        wanted = bool(self.brain.needs_images(results or {})[0])
         if wanted and (self.freezes_after is None or sum(self.images_wanted) < self.freezes_after):
             self._image = self._random.integers(0, 255, (1, 8, 8, 3), np.uint8)
         self.images_wanted.append(wanted)
-        state = np.array([[0.0, self.opening]])
+        self.state[:, 1] = self.opening
         truth: Any = Forbidden()
-        goals = self.brain.act(Observation(OBSERVED, state, {"scene": self._image} if wanted else {}, truth, results))
-        assert isinstance(goals, Goals)
-        for command in goals.commands.get(0, []):
-            self.given.append(command)
-            return command
-        return None
+        images = {"scene": self._image} if wanted else {}
+        return self.show(Observation(OBSERVED, self.state, images, truth, results or {}))
+
+    def frame(self) -> BrainCommand | None:
+        return self.look().get(0)
 
     def grasp(self, opening: float) -> None:
         """Go down and close on what has this width [m]."""
         for _ in range(3):
-            self.end() if self.given else self.frame()
+            self.end() if self.given[0] else self.frame()
         self.opening = opening
-
-    def end(self, success: bool = True, message: str = "") -> BrainCommand | None:
-        code = ResultCode.SUCCEEDED if success else ResultCode.PATH_TOLERANCE
-        return self.frame(CommandResult(self.given[-1].task_id, success, code, message))
-
-    @property
-    def steps(self) -> list[str]:
-        return [one.task_id.split("-", 1)[1] for one in self.given]
 
     @property
     def problem(self) -> str:
@@ -132,7 +119,7 @@ def test_it_goes_where_it_sees_what_is_meant_and_needs_nothing_that_the_task_tel
     table.opening = 2 * meant.size_y
     while table.end() is not None:
         pass
-    assert table.steps == ["above", "down", "close", "lift"]
+    assert table.steps() == ["above", "down", "close", "lift"]
     assert table.eyes.count == 1
     assert table.brain.parameters()["perception"]["weights"] == "sha256:0"
     assert "weights" not in LanguageBrain().parameters()["perception"]
@@ -155,7 +142,7 @@ def test_the_fingers_open_wider_for_what_is_known_less_exactly() -> None:
     for error in (0.0, 0.004, 0.025):
         table = Table([seen(CUP, 0, error=error)])
         table.frame()
-        openings.append(table.given[0].gripper)
+        openings.append(table.given[0][0].gripper)
     assert openings[1] == pytest.approx(min(MAX_OPENING, openings[0] + 0.008))
     assert openings[2] == MAX_OPENING
 
@@ -208,7 +195,7 @@ def test_with_a_camera_that_does_not_change_while_the_arm_moves_it_does_not_go_d
     table = Table(BOTH, frozen=True)
     assert table.frame() is not None
     assert table.end() is None
-    assert table.steps == ["above"]
+    assert table.steps() == ["above"]
     assert "shows the same image although the arm has moved" in table.problem
 
 
@@ -220,7 +207,7 @@ def test_a_camera_that_freezes_later_is_noticed_before_the_tool_goes_down_again(
     table.grasp(0.0)
     while table.end() is not None:
         pass
-    assert table.steps == ["above", "down", "close", "back", "home", "above"][: 5 + (last == "above")]
+    assert table.steps() == ["above", "down", "close", "back", "home", "above"][: 5 + (last == "above")]
     assert "shows the same image although the arm has moved" in table.problem
 
 
@@ -228,7 +215,7 @@ def test_an_arm_that_did_not_move_says_nothing_of_its_camera() -> None:
     table = Table(BOTH, frozen=True)
     table.frame()
     assert table.end(success=False, message="No posture reaches the pose.") is not None
-    assert table.steps == ["above", "back"]
+    assert table.steps() == ["above", "back"]
     assert table.problem == "No posture reaches the pose."
     assert table.end() is None  # it has moved now, and still the image is the same
     assert "shows the same image although the arm has moved" in table.problem
@@ -239,9 +226,9 @@ def test_an_arm_that_does_not_get_out_of_the_way_is_not_looked_past() -> None:
     table.grasp(0.0)
     table.end()
     table.end()
-    assert table.steps[-1] == "home"
+    assert table.steps()[-1] == "home"
     assert table.end(success=False, message="The path is blocked.") is None
-    assert table.steps[-1] == "home"
+    assert table.steps()[-1] == "home"
     assert table.problem.endswith("stays there: The path is blocked.")
     assert table.eyes.count == 1
 
@@ -253,7 +240,7 @@ def test_fingers_that_close_on_nothing_hold_nothing_however_thin_the_object_is(w
         table = Table([seen(thing, 0)], instruction="pick up the red box")
         table.grasp(max(opening, width - 0.03))
         table.end()
-        assert table.steps[-1] == then
+        assert table.steps()[-1] == then
 
 
 def test_after_a_miss_it_goes_home_and_looks_again() -> None:
@@ -261,7 +248,7 @@ def test_after_a_miss_it_goes_home_and_looks_again() -> None:
     table = Table(BOTH, (seen(BOX, 0), seen(CUP, 1, off=0.05)))
     table.grasp(0.0)  # closed on nothing
     assert table.end() is not None
-    assert table.steps[-1] == "back"
+    assert table.steps()[-1] == "back"
     home = table.end()
     assert home is not None
     assert home.joint_target == ur5().arm.home[:-1]
@@ -274,7 +261,7 @@ def test_after_a_miss_it_goes_home_and_looks_again() -> None:
     table.opening = 2 * CUP.size_x
     table.end()
     table.end()
-    assert table.steps[-1] == "lift"
+    assert table.steps()[-1] == "lift"
     plan = table.brain.plan(0)
     assert plan["chosen"] == 0, "what is evaluated is the first look"
     assert plan["seen"][0]["position"][0] == pytest.approx(CUP.x)
@@ -286,7 +273,7 @@ def test_what_slips_out_while_it_is_lifted_is_noticed_by_the_fingers() -> None:
     table.end()
     table.opening = 0.0
     table.end()
-    assert table.steps[-2:] == ["lift", "back"]
+    assert table.steps()[-2:] == ["lift", "back"]
     assert table.problem == "the object was not lifted"
 
 

@@ -45,14 +45,6 @@ def test_it_asks_for_the_target_once_and_holds() -> None:
     assert desk.look() == {}
 
 
-def test_a_known_camera_error_is_subtracted() -> None:
-    desk = Desk(camera_error_m=[0.02, -0.01, 0.1])
-    goal = desk.look()[0]
-    assert goal.target_pose is not None
-    assert goal.target_pose.position == pytest.approx(TARGET[:3] - (0.02, -0.01, 0.1), abs=1e-15)
-    assert goal.target_pose.quaternion == pytest.approx(tuple(TARGET[3:]))
-
-
 def test_a_quaternion_in_single_precision_is_made_a_unit_again() -> None:
     desk = Desk()
     desk.targets[0, 3:] = np.array([0.1, 0.7, 0.7, 0.1]).astype(np.float32)
@@ -99,11 +91,6 @@ def test_what_is_no_pose_is_not_reached_for(target: list[float]) -> None:
 def test_a_speed_that_no_joint_of_the_arm_has_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"brain\.max_velocity is 3\.2; .* 3\.14159 rad/s"):
         ReachBrain(ReachBrainConfig(max_velocity=3.2)).bind(RobotFeatures((), (), 25, ENVIRONMENT, body=ur5()))
-
-
-def test_a_task_without_a_target_is_refused() -> None:
-    with pytest.raises(ConfigError, match="'reach' needs the environment feature"):
-        ReachBrain().bind(RobotFeatures(("a",), ("a",), 25, (), body=ur5()))
 
 
 def test_with_a_camera_error_it_reaches_as_before_if_it_knows_and_misses_if_not() -> None:

@@ -10,7 +10,7 @@ from bhd_lerobot.bodies.tabletop import MAX_OBJECTS, OBJECT_FIELDS
 from bhd_lerobot.bodies.ur import MAX_OPENING, ur5
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
-from bhd_lerobot.policies.manipulation.servo import PickServoBrain, PickServoConfig, ReachServoBrain, ServoConfig
+from bhd_lerobot.policies.manipulation.servo import PickServoBrain, PickServoConfig, ReachServoBrain
 from bhd_lerobot.robots.parts.names import TOOL_NAMES
 from bhd_lerobot.tasks.pick import ENVIRONMENT, PickConfig, PickTask
 from bhd_lerobot.tasks.reach import ReachConfig, ReachTask
@@ -133,11 +133,6 @@ def test_without_an_object_or_a_target_it_stays_where_it_is() -> None:
     reach.bind(features(POSE))
     for told in (np.zeros((5, 7)), np.full((5, 7), np.nan)):
         assert np.allclose(reach.act(Observation(TOOL_NAMES, state, {}, told)), state)
-
-
-def test_an_error_of_the_camera_that_cannot_be_is_refused() -> None:
-    with pytest.raises(ConfigError, match="camera_error_m"):
-        ServoConfig(camera_error_m=[0.0, 1.0, 0.0])
 
 
 def test_a_robot_that_takes_joint_positions_is_refused() -> None:

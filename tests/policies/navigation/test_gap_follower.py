@@ -1,6 +1,7 @@
-"""Laws of the gap follower: limits, symmetry, sides, memory, independence of n, and what it achieves."""
+"""Laws of the gap follower beside those of `test_driving.py`: symmetry, sides, memory, and what it achieves."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,6 @@ import pytest
 from bhd_lerobot.bodies.arenas import Arena
 from bhd_lerobot.bodies.body import Shape
 from bhd_lerobot.bodies.differential_base import differential_base
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION, turtlebot3_burger
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.clearance import QUANTUM, ClearanceTable, Footprint, Level, make_paths
@@ -20,48 +20,19 @@ from bhd_lerobot.rollout.types import EpisodeSpec
 from bhd_lerobot.tasks.avoid import AvoidConfig, AvoidTask
 from bhd_lerobot.tasks.task import Outcome, episode_seed
 from tests.cases import each_case
+from tests.policies.navigation import test_driving as driving
+from tests.policies.navigation.test_driving import BURGER, inside_box, random_scans, see
 
-BURGER = turtlebot3_burger()
-ACTIONS = ("x.vel", "theta.vel")
 BEAMS = (36, 90, 360)
 
 
-def names_of(beams: int) -> tuple[str, ...]:
-    return ("x.vel", "theta.vel", *(f"scan_{beam:03d}.pos" for beam in range(beams)))
-
-
-def bound(beams: int, n: int, config: GapFollowerConfig | None = None) -> GapFollowerBrain:
-    brain = GapFollowerBrain(config)
-    brain.bind(RobotFeatures(names_of(beams), ACTIONS, 10, body=BURGER))
-    brain.reset(np.arange(n), [0] * n, n)
-    return brain
-
-
-def see(brain: GapFollowerBrain, scan: np.ndarray, twist: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-    scan = np.atleast_2d(scan)
-    state = np.hstack([np.tile(twist, (len(scan), 1)), scan])
-    return brain.act(Observation(names_of(scan.shape[1]), state))
+def bound(beams: int, n: int, config: GapFollowerConfig | None = None, body: Any = BURGER) -> GapFollowerBrain:
+    return driving.bound(GapFollowerBrain, n, beams, config, body)
 
 
 def decide(scan: np.ndarray) -> np.ndarray:
     scan = np.atleast_2d(scan)
     return see(bound(scan.shape[1], len(scan)), scan)
-
-
-def inside_box(beams: int, front: float, back: float, left: float, right: float) -> np.ndarray:
-    """Return the scan of a robot in a rectangle, distances from the range finder."""
-    angle = 2 * np.pi * np.arange(beams) / beams
-    with np.errstate(divide="ignore"):
-        x = np.where(np.cos(angle) > 0, front, back) / np.abs(np.cos(angle))
-        y = np.where(np.sin(angle) > 0, left, right) / np.abs(np.sin(angle))
-    return np.clip(np.minimum(x, y), 0.12, 3.5)
-
-
-def random_scans(n: int, beams: int = 360, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    scale = rng.choice([0.3, 1.0, 3.5], (n, 1))
-    smooth = np.cumsum(rng.normal(0, 0.1, (n, beams)), axis=1)
-    return np.clip(scale * (0.6 + smooth / 2), 0.12, 3.5)
 
 
 @each_case("beams", BEAMS)
@@ -72,41 +43,10 @@ def test_it_turns_to_the_free_side(beams: int) -> None:
     assert decide(open_right)[0, 1] < -0.3
 
 
-def test_it_never_asks_for_more_than_the_robot_can() -> None:
-    scan = np.vstack([random_scans(1000, seed=1), np.full((1, 360), 0.12), np.full((1, 360), 3.5)])
-    brain = bound(360, len(scan))
-    rim = MAX_ANGULAR * WHEEL_SEPARATION / 2
-    for step in range(5):
-        action = see(brain, np.roll(scan, 40 * step, axis=1), (0.2, 0.3))
-        assert np.isfinite(action).all()
-        assert (np.abs(action[:, 0]) <= MAX_LINEAR).all()
-        assert (np.abs(action[:, 1]) <= MAX_ANGULAR).all()
-        assert (np.abs(action[:, 0]) + np.abs(action[:, 1]) * WHEEL_SEPARATION / 2 <= rim + 1e-9).all()
-
-
-@pytest.mark.law
-@each_case("beams", [36, 360])
-@each_case("distance", [0.12, 0.2])
-def test_it_does_not_drive_into_a_wall(beams: int, distance: float) -> None:
-    assert decide(inside_box(beams, front=distance, back=3.0, left=1.0, right=1.0))[0, 0] <= 0
-    assert decide(inside_box(beams, front=distance, back=distance, left=distance, right=distance))[0, 0] <= 0
-
-
 def test_wedged_in_a_slot_it_backs_off() -> None:
     forward, turn = decide(inside_box(360, front=0.125, back=2.0, left=0.12, right=0.12))[0]
     assert forward < 0
     assert turn == 0
-
-
-@pytest.mark.law
-@each_case("blind", [np.nan, np.inf, -np.inf, 0.0, 0.11, 3.6])
-def test_blind_it_stops_and_sees_again(blind: float) -> None:
-    brain = bound(90, 2)
-    scan = np.full((2, 90), 3.5)
-    scan[0] = blind
-    assert see(brain, scan).tolist() == [[0, 0], [0.22, 0]]
-    scan[0] = 3.5
-    assert see(brain, scan).tolist() == [[0.22, 0]] * 2
 
 
 @each_case("beams", [36, 90, 360])
@@ -159,24 +99,13 @@ def test_reset_forgets_only_the_given_simulations() -> None:
     assert np.array_equal(see(brain, scans[:2]), fresh[:2])
 
 
-def test_a_robot_that_it_cannot_drive_is_refused() -> None:
-    with pytest.raises(ConfigError, match="was reset for 2 robots and sees 3"):
-        see(bound(90, 2), np.full((3, 90), 1.0))
-    with pytest.raises(ConfigError, match="needs at least 36 beams; this robot has 30"):
-        bound(30, 1)
-    with pytest.raises(ConfigError, match=r"'gap_follower' needs the observation feature\(s\) theta\.vel"):
-        GapFollowerBrain().bind(RobotFeatures(("x.vel", *names_of(90)[2:]), ACTIONS, 10, body=BURGER))
-
-
 @each_case(("asked", "speed"), [({}, 0.5), ({"forward_speed": 0.1}, 0.1), ({"rim_speed": 0.3}, 0.3)])
 def test_speeds_and_ranges_are_those_of_the_base_where_they_are_not_set(asked: dict[str, float], speed: float) -> None:
     base = differential_base(
         "rover", wheel_radius=0.06, wheel_separation=0.2, size=(0.24, 0.18, 0.08), mass=2.5, max_velocity=(0.5, 2.5)
     )
-    brain = GapFollowerBrain(GapFollowerConfig(**asked))
     body = replace(base, lidar=replace(base.lidar, range_min=0.05, range_max=8.0))
-    brain.bind(RobotFeatures(names_of(90), ACTIONS, 10, body=body))
-    brain.reset(np.arange(1), [0], 1)
+    brain = bound(90, 1, GapFollowerConfig(**asked), body)
     assert brain.parameters()["forward_speed"] == speed
     assert (brain.parameters()["range_min_m"], brain.parameters()["range_max_m"]) == (0.05, 8.0)
     assert see(brain, np.full(90, 8.0))[0] == pytest.approx([speed, 0.0])
@@ -186,27 +115,6 @@ def test_what_does_not_fit_the_base_is_refused() -> None:
     for asked in ({"forward_speed": 0.3}, {"range_min_m": 4.0}):
         with pytest.raises(ConfigError, match=rf"brain\.{next(iter(asked))} is {next(iter(asked.values()))}"):
             bound(90, 1, GapFollowerConfig(**asked))
-
-
-def test_straight_ahead_the_table_is_plain_geometry() -> None:
-    paths = make_paths(0.22, 0.2272, Footprint.of(BURGER))
-    straight = int(np.flatnonzero(paths.heading == 0)[0])
-    table = ClearanceTable(paths, 360, 0.0, (Level(0.05, 0.005),), 3.5)
-    for distance in (0.3, 0.7, 1.5, 3.0):
-        scan = np.full((1, 360), 3.5)
-        scan[0, 0] = distance
-        free = table.clear(table.rows(scan), 0)[0, straight] * QUANTUM
-        assert free == pytest.approx(BURGER.lidar.ahead + distance - 0.038 - 0.05, abs=2 * QUANTUM)
-
-
-def test_more_margin_never_gives_more_room() -> None:
-    paths = make_paths(0.22, 0.2272, Footprint.of(BURGER))
-    table = ClearanceTable(paths, 120, 0.01, (Level(0.1, 0.0), Level(0.05, 0.0), Level(0.0, 0.0)), 3.5)
-    rows = table.rows(random_scans(50, 120, seed=2))
-    wide, usual, tight = (table.clear(rows, level) for level in range(3))
-    assert (wide <= usual).all()
-    assert (usual <= tight).all()
-    assert (wide < tight).any()
 
 
 @pytest.mark.parametrize("sectors", [36, 120])

@@ -1,4 +1,4 @@
-"""Laws of the navigator: limits, symmetry, the last turn, its map, independence of n, and what it achieves."""
+"""Laws of the navigator beside those of `test_driving.py`: symmetry, the last turn, its map, and what it achieves."""
 
 import math
 from dataclasses import replace
@@ -8,11 +8,10 @@ import pytest
 
 from bhd_lerobot.bodies.arenas import Arena, make_arena
 from bhd_lerobot.bodies.body import Shape
-from bhd_lerobot.bodies.turtlebot3 import MAX_ANGULAR, MAX_LINEAR, WHEEL_SEPARATION
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Observation, RobotFeatures
 from bhd_lerobot.policies.navigation.goal_map import CELL, GoalMap
-from bhd_lerobot.policies.navigation.navigator import GOAL, NavigatorBrain, NavigatorConfig
+from bhd_lerobot.policies.navigation.navigator import NavigatorBrain
 from bhd_lerobot.robots.config_turtlebot3 import TurtleBot3Config
 from bhd_lerobot.robots.host.simulation import Simulation
 from bhd_lerobot.rollout.episode import EpisodeLoop
@@ -20,26 +19,22 @@ from bhd_lerobot.rollout.types import Episode, EpisodeSpec
 from bhd_lerobot.tasks.navigate import NavigateConfig, NavigateTask
 from bhd_lerobot.tasks.task import Event, episode_seed
 from tests.cases import each_case
-from tests.policies.navigation.test_gap_follower import ACTIONS, BURGER, names_of
+from tests.policies.navigation import test_driving as driving
+from tests.policies.navigation.test_driving import ACTIONS, BURGER, names_of
 
 OPEN = np.full(360, 3.5)
 
 
-def bound(n: int = 1, beams: int = 360, config: NavigatorConfig | None = None) -> NavigatorBrain:
-    brain = NavigatorBrain(config)
-    brain.bind(RobotFeatures(names_of(beams), ACTIONS, 10, GOAL, body=BURGER))
-    brain.reset(np.arange(n), [0] * n, n)
-    return brain
+def bound(n: int = 1, beams: int = 360) -> NavigatorBrain:
+    return driving.bound(NavigatorBrain, n, beams)
+
+
+def see(brain: NavigatorBrain, goal: np.ndarray, scan: np.ndarray = OPEN) -> np.ndarray:
+    return driving.see(brain, scan, goal=goal)
 
 
 def goal_at(x: float, y: float, yaw: float = 0.0) -> np.ndarray:
     return np.array([[x, y, math.cos(yaw), math.sin(yaw)]])
-
-
-def see(brain: NavigatorBrain, goal: np.ndarray, scan: np.ndarray = OPEN) -> np.ndarray:
-    scan = np.atleast_2d(scan)
-    state = np.hstack([np.zeros((len(scan), 2)), scan])
-    return brain.act(Observation(names_of(scan.shape[1]), state, environment_state=goal))
 
 
 def run(scenes: list[Arena] | list[int], n: int = 8) -> list[Episode]:
@@ -94,35 +89,6 @@ def test_at_the_goal_it_turns_to_its_heading_and_rests(side: int) -> None:
     assert see(brain, goal_at(0.07, 0.0, 0.0))[0, 0] > 0  # in another episode it has not been there
 
 
-def test_it_never_asks_for_more_than_the_robot_can() -> None:
-    rng = np.random.default_rng(1)
-    n = 60
-    brain, rim = bound(n), MAX_ANGULAR * WHEEL_SEPARATION / 2
-    for _ in range(3):
-        scan = np.clip(rng.uniform(0.1, 4.0, (n, 1)) + rng.normal(0, 0.3, (n, 360)), 0.12, 3.5)
-        goal = np.vstack([goal_at(*rng.uniform(-20, 20, 2), rng.uniform(-3, 3)) for _ in range(n)])
-        action = see(brain, goal, scan)
-        assert np.isfinite(action).all()
-        assert (np.abs(action[:, 0]) <= MAX_LINEAR).all()
-        assert (np.abs(action[:, 0]) + np.abs(action[:, 1]) * WHEEL_SEPARATION / 2 <= rim + 1e-9).all()
-
-
-@pytest.mark.parametrize("distance", [0.12, 0.2])
-def test_it_does_not_drive_into_a_wall_before_the_goal(distance: float) -> None:
-    scan = OPEN.copy()
-    scan[-45:] = scan[:46] = distance
-    assert see(bound(), goal_at(2.0, 0.0), scan)[0, 0] <= 0
-
-
-def test_what_it_sees_is_not_written_to() -> None:
-    brain = bound(2)
-    state = np.hstack([np.zeros((2, 2)), np.tile(OPEN, (2, 1))])
-    state.flags.writeable = False
-    brain.act(Observation(names_of(360), state, environment_state=np.repeat(goal_at(2.0, 0.0), 2, axis=0)))
-    brain.reset(np.array([1]), [0], 2)
-    assert np.isfinite(state).all()
-
-
 @each_case("bad", [math.nan, math.inf])
 @each_case("column", range(4))
 def test_without_a_goal_it_stands_and_goes_on_with_one(bad: float, column: int) -> None:
@@ -134,13 +100,6 @@ def test_without_a_goal_it_stands_and_goes_on_with_one(bad: float, column: int) 
     assert action[0].tolist() == [0.0, 0.0]
     assert action[1, 0] > 0.19
     assert (see(brain, goal, scan)[:, 0] > 0.19).all()
-
-
-@each_case("blind", [np.nan, np.inf, 0.0, 3.6])
-def test_blind_it_stops_and_sees_again(blind: float) -> None:
-    brain = bound()
-    assert see(brain, goal_at(2.0, 0.0), np.full(360, blind)).tolist() == [[0.0, 0.0]]
-    assert see(brain, goal_at(2.0, 0.0))[0, 0] > 0.19
 
 
 def test_ways_lead_around_what_was_seen_and_are_planned_again_only_where_it_is_in_the_way() -> None:
@@ -200,23 +159,3 @@ def test_what_it_cannot_drive_is_refused_with_what_is_missing() -> None:
         NavigatorBrain().bind(RobotFeatures(names_of(90), ACTIONS, 10, (), body=BURGER))
     with pytest.raises(ConfigError, match="received none"):
         bound().act(Observation(names_of(360), np.zeros((1, 362))))
-    with pytest.raises(ConfigError, match="needs a range scan"):
-        NavigatorBrain().bind(RobotFeatures(("x.vel", "theta.vel"), ACTIONS, 10, GOAL, body=BURGER))
-    with pytest.raises(ConfigError, match="needs at least 36 beams"):
-        bound(beams=20)
-    with pytest.raises(ConfigError, match="reset for 1 robots and sees 2"):
-        see(bound(), np.vstack([goal_at(1, 0)] * 2), np.vstack([OPEN] * 2))
-
-
-def test_many_robots_decide_like_each_alone_to_the_last_bit() -> None:
-    rng, n = np.random.default_rng(7), 5
-    goals = np.vstack([goal_at(*rng.uniform(-3, 3, 2), rng.uniform(-3, 3)) for _ in range(n)])
-    scans = np.clip(np.cumsum(rng.normal(0, 0.1, (6, n, 360)), axis=2) / 2 + 1.5, 0.3, 3.5)
-
-    def drive(ids: list[int]) -> np.ndarray:
-        brain = bound(len(ids))
-        return np.array([see(brain, goals[ids], scan[ids]) for scan in scans])
-
-    together = drive(list(range(n)))
-    for sim in range(n):
-        assert drive([sim])[:, 0].tobytes() == together[:, sim].tobytes()

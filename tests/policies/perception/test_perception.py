@@ -68,15 +68,6 @@ def test_labels_are_what_the_brain_that_knows_the_truth_reads() -> None:
             assert list(COLOURS)[int(labels.colour[row, one.index])] == scene_object(one).colour
 
 
-def test_the_labels_of_cells_are_those_of_the_object_that_they_name() -> None:
-    labels = Labels.of(torch.from_numpy(states(3)))
-    places = torch.randint(0, 5, (3, 4, 6))
-    chosen = labels.at(places)
-    for index in np.ndindex(3, 4, 6):
-        assert torch.equal(chosen.position[index], labels.position[index[0], places[index]])
-        assert chosen.colour[index] == labels.colour[index[0], places[index]]
-
-
 def test_it_finds_what_it_was_not_shown_and_states_errors_as_large_as_its_errors(trained: PerceptionPolicy) -> None:
     values = states(500, max_objects=2)[400:]
     errors, objects, inside, looked = [], 0, 0, 0

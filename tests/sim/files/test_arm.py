@@ -1,5 +1,6 @@
 """Arms from files: what is read agrees with MuJoCo, whatever the file is like, and what is missing is asked for."""
 
+import functools
 import os
 import re
 from dataclasses import replace
@@ -47,6 +48,22 @@ def written(folder: Path, text: str, name: str = "arm.xml", **options: object) -
     return ArmFile("arm", str(path), **options)  # type: ignore[arg-type]
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for files of this module, with what some of them include."""
+    made = tmp_path_factory.mktemp("arms")
+    (made / "assets").mkdir()
+    (made / "assets" / "link.obj").write_text(LINK, encoding="utf-8")
+    (made / "child.xml").write_text(TEXT, encoding="utf-8")
+    return made
+
+
+@functools.cache
+def built(folder: Path, text: str, **options: object) -> Body:
+    """Return the arm of a file with a text, which takes a second."""
+    return arm_body(written(folder, text, f"{len(list(folder.iterdir()))}.xml", **options))
+
+
 def tool_poses(body: Body, postures: np.ndarray) -> np.ndarray:
     """Return where MuJoCo has the tool, shape (n, 4, 4)."""
     model = mujoco.MjModel.from_xml_string(body.mjcf)
@@ -81,8 +98,8 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_tool_and_torques_are_those_of_mujoco(variant: str, tmp_path: Path) -> None:
-    body = arm_body(written(tmp_path, VARIANTS[variant]))
+def test_tool_and_torques_are_those_of_mujoco_and_home_is_free_and_before_the_arm(variant: str, folder: Path) -> None:
+    body = built(folder, VARIANTS[variant])
     arm, postures = body.need(Arm), postures_of(body)
     np.testing.assert_allclose(ForwardKinematics(arm.chain).tool(postures), tool_poses(body, postures), atol=1e-6)
     model = mujoco.MjModel.from_xml_string(body.mjcf)
@@ -102,23 +119,15 @@ def test_tool_and_torques_are_those_of_mujoco(variant: str, tmp_path: Path) -> N
         wanted = data.qfrc_inverse + data.qfrc_constraint
         found = ArmDynamics(body).torque(posture[None], speed[None], acceleration[None])[0]
         np.testing.assert_allclose(found, wanted[[place.dofadr[0] for place in places]], atol=2e-3)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_home_is_free_and_before_the_arm(variant: str, tmp_path: Path) -> None:
-    body = arm_body(written(tmp_path, VARIANTS[variant]))
-    arm = body.need(Arm)
     kinematics, home = ArmKinematics(arm.chain, arm.limits), np.array(arm.home[: arm.chain.dof])
     assert int(kinematics.check(home[None])[0]) == ResultCode.SUCCEEDED
     low, high = np.array(arm.workspace.tool)
     assert ((kinematics.tool(home)[:3, 3] > low) & (kinematics.tool(home)[:3, 3] < high)).all()
 
 
-def test_however_the_file_is_written_it_is_the_same_arm(tmp_path: Path) -> None:
-    plain, scene, elsewhere = (
-        arm_body(written(tmp_path, VARIANTS[name], f"{number}.xml")).need(Arm)
-        for number, name in enumerate(("as it is", "a scene", "elsewhere"))
-    )
+def test_however_the_file_is_written_it_is_the_same_arm(folder: Path) -> None:
+    names = ("as it is", "a scene", "elsewhere")
+    plain, scene, elsewhere = (built(folder, VARIANTS[name]).need(Arm) for name in names)
     for other in (scene, elsewhere):
         np.testing.assert_allclose(other.home, plain.home, atol=1e-5)
         np.testing.assert_allclose(other.limits.acceleration, plain.limits.acceleration, rtol=1e-4)
@@ -131,7 +140,7 @@ def test_however_the_file_is_written_it_is_the_same_arm(tmp_path: Path) -> None:
     degrees = degrees.replace('euler="0 -0.1745 0"', 'euler="0 -9.998 0"').replace(
         'euler="0 0.11 0"', 'euler="0 6.303 0"'
     )
-    body = arm_body(written(tmp_path, degrees, "degrees.xml"))
+    body = built(folder, degrees)
     turned, model = body.need(Arm), World(body).model
     np.testing.assert_allclose(turned.limits.upper, plain.limits.upper, atol=1e-5)
     ends = [model.joint(name).range[1] for name in turned.chain.joints]
@@ -149,16 +158,15 @@ LINK = "v 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0 0 0.01\nf 1 3 2\nf 1 2 4\nf 1 4 3\n
 @each_case(
     "text",
     [
-        TEXT.replace('<camera name="wrist" ', "<camera "),
-        TEXT.replace(
+        TEXT.replace('<camera name="wrist" ', "<camera ")
+        .replace(
             "<asset>",
             '<asset><texture name="sky" type="skybox" builtin="gradient" width="8" height="8"/>'
             '<material name="floor"/><material name="table"/><material name="leg"/>',
-        ),
-        TEXT.replace("<worldbody>", FLOOR).replace(
-            "</worldbody>", '</worldbody><contact><pair geom1="floor" geom2="moving_jaw"/></contact>'
-        ),
-        TEXT.replace("<actuator>", '<actuator><adhesion name="suck" body="jaw" gain="1" ctrlrange="0 1"/>'),
+        )
+        .replace("<worldbody>", FLOOR)
+        .replace("</worldbody>", '</worldbody><contact><pair geom1="floor" geom2="moving_jaw"/></contact>')
+        .replace("<actuator>", '<actuator><adhesion name="suck" body="jaw" gain="1" ctrlrange="0 1"/>'),
         TEXT.replace(
             '<position name="gripper" joint="gripper"/>',
             '<position name="gripper" joint="gripper" gear="2" kp="4.45" forcerange="-1.47 1.47"/>',
@@ -172,12 +180,9 @@ LINK = "v 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0 0 0.01\nf 1 3 2\nf 1 2 4\nf 1 4 3\n
         ATTACHED,
     ],
 )
-def test_a_file_with_parts_that_are_not_the_arms_is_simulated_as_the_same_arm(text: str, tmp_path: Path) -> None:
-    (tmp_path / "assets").mkdir()
-    (tmp_path / "assets" / "link.obj").write_text(LINK, encoding="utf-8")
-    (tmp_path / "child.xml").write_text(TEXT, encoding="utf-8")
-    plain, body = (arm_body(written(tmp_path, one, f"{number}.xml")) for number, one in enumerate((TEXT, text)))
-    arm, wanted = body.need(Arm), plain.need(Arm)
+def test_a_file_with_parts_that_are_not_the_arms_is_simulated_as_the_same_arm(text: str, folder: Path) -> None:
+    body = built(folder, text)
+    arm, wanted = body.need(Arm), built(folder, TEXT).need(Arm)
     np.testing.assert_allclose(arm.limits.effort, wanted.limits.effort, rtol=1e-6)
     np.testing.assert_allclose(arm.limits.upper, wanted.limits.upper, atol=1e-6)
     world = World(body)
@@ -216,9 +221,8 @@ def test_obstacles_are_kept_away_from_by_all_that_a_joint_moves(tmp_path: Path) 
         assert pairs["obstacle_0", capsule.name] < 0.0, capsule.name
 
 
-def test_of_two_arms_in_a_file_what_couples_joints_of_the_other_is_left_out(tmp_path: Path) -> None:
-    text = TEXT.replace("</worldbody>", OTHER)
-    model = World(arm_body(written(tmp_path, text, tool="gripper_frame"))).model
+def test_of_two_arms_in_a_file_what_couples_joints_of_the_other_is_left_out(folder: Path) -> None:
+    model = World(built(folder, TEXT.replace("</worldbody>", OTHER), tool="gripper_frame")).model
     assert (model.neq, model.ntendon) == (0, 0)
 
 
@@ -230,11 +234,8 @@ def test_of_two_arms_in_a_file_what_couples_joints_of_the_other_is_left_out(tmp_
         ('<geom condim="3"', '<geom condim="3" priority="2" solref="0.1 1"'),
     ],
 )
-def test_defaults_of_a_file_are_those_of_its_robot_alone(default: tuple[str, str], tmp_path: Path) -> None:
-    plain, other = (
-        World(arm_body(written(tmp_path, text, f"{number}.xml"))).model
-        for number, text in enumerate((TEXT, TEXT.replace(*default)))
-    )
+def test_defaults_of_a_file_are_those_of_its_robot_alone(default: tuple[str, str], folder: Path) -> None:
+    plain, other = (World(built(folder, text)).model for text in (TEXT, TEXT.replace(*default)))
     for name in ("gear", "ctrllimited", "gainprm", "biasprm"):
         values = getattr(other, f"actuator_{name}"), getattr(plain, f"actuator_{name}")
         np.testing.assert_allclose(*values, rtol=1e-9)
@@ -251,10 +252,11 @@ def test_defaults_of_a_file_are_those_of_its_robot_alone(default: tuple[str, str
         ('<geom name="foot"', '<geom name="floor"'),
     ],
 )
-def test_a_name_of_our_scene_is_refused(there: str, named: str, tmp_path: Path) -> None:
-    body = arm_body(written(tmp_path, TEXT.replace(there, named)))
+def test_a_name_of_our_scene_is_refused(there: str, named: str, folder: Path) -> None:
+    body = built(folder, TEXT)
+    assert there in body.mjcf
     with pytest.raises(ConfigError, match="Rename it in the file of the robot"):
-        Tabletop(World(body))
+        Tabletop(World(replace(body, mjcf=body.mjcf.replace(there, named))))
 
 
 def test_speeds_of_a_urdf_are_those_of_its_limits(tmp_path: Path) -> None:
@@ -288,9 +290,9 @@ def test_meshes_of_a_urdf_are_found_where_mujoco_looks_for_them(compiler: str, t
     ],
 )
 def test_motors_give_the_torque_that_is_said_of_them_and_carry_the_arm_with_it(
-    text: str, effort: tuple[float, ...], tmp_path: Path
+    text: str, effort: tuple[float, ...], folder: Path
 ) -> None:
-    body = arm_body(written(tmp_path, text, effort=effort))
+    body = built(folder, text, effort=effort) if effort else built(folder, text)
     world, joints = World(body), body.need(Arm).chain.joints
     torque, dofs = world.derived("qfrc_actuator"), world.joint_slice(joints)[1]
     for way in (-1.0, 1.0):
@@ -304,12 +306,13 @@ def test_motors_give_the_torque_that_is_said_of_them_and_carry_the_arm_with_it(
     "text",
     [
         TEXT,
-        TEXT.replace('damping="0.6"', 'damping="0.6" stiffness="6" springref="0.8"'),
-        TEXT.replace('<geom condim="3"', '<geom condim="3" margin="0.05"'),
+        TEXT.replace('damping="0.6"', 'damping="0.6" stiffness="6" springref="0.8"').replace(
+            '<geom condim="3"', '<geom condim="3" margin="0.05"'
+        ),
     ],
 )
-def test_neither_springs_nor_margins_move_an_arm_that_is_held_over_the_table(text: str, tmp_path: Path) -> None:
-    body = arm_body(written(tmp_path, text))
+def test_neither_springs_nor_margins_move_an_arm_that_is_held_over_the_table(text: str, folder: Path) -> None:
+    body = built(folder, text)
     arm, pose = body.need(Arm), np.diag((1.0, -1.0, -1.0, 1.0))
     pose[:3, 3] = np.mean(arm.workspace.table, axis=0)[0], 0.0, arm.workspace.handling.lowest
     posture = ArmKinematics(arm.chain, arm.limits).solve(pose, np.array(arm.home[:-1])).postures[0]
@@ -332,9 +335,9 @@ def test_neither_springs_nor_margins_move_an_arm_that_is_held_over_the_table(tex
     ],
 )
 def test_the_opening_is_read_and_commanded_in_metres(
-    gripper: GripperFile, at: float, opening: float, tmp_path: Path
+    gripper: GripperFile, at: float, opening: float, folder: Path
 ) -> None:
-    body = arm_body(written(tmp_path, TEXT, gripper=gripper))
+    body = built(folder, TEXT, gripper=gripper)
     spec = body.need(GripperSpec)
     assert spec.joints_at(opening) == pytest.approx([at], abs=1e-6)
     world = World(body)
