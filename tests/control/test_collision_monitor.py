@@ -66,7 +66,7 @@ def drive(
 
 
 @pytest.mark.thorough(but=1)
-@pytest.mark.parametrize(("stream", "seconds"), [(straight, 6.0), (backward, 8.0), (circles, 15.0), (anything, 15.0)])
+@pytest.mark.parametrize(("stream", "seconds"), [(straight, 5.0), (backward, 6.0), (circles, 10.0), (anything, 15.0)])
 def test_whoever_commands_it_a_base_touches_nothing(stream: Stream, seconds: float) -> None:
     touched, *_ = drive(stream, seconds, monitor=False, enough=3)
     assert touched.sum() >= 3  # without the monitor

@@ -107,7 +107,7 @@ def test_a_hard_stop_changes_no_faster_and_arrives_exactly_after_the_ticks_that_
     assert out.tobytes() == target.tobytes()
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     targets=arrays(np.float64, (6, N, 2), elements=st.sampled_from([-0.3, 0.0, 0.3]) | st.floats(-0.3, 0.3)),
     ticks=st.integers(1, 60),
@@ -138,6 +138,7 @@ def test_changes_change_gradually_and_arrive_without_overshoot(
         last = command
 
 
+@settings(max_examples=30)
 @given(targets=arrays(np.float64, (8, N, 2), elements=ANY), hard=st.lists(st.booleans(), min_size=8, max_size=8))
 def test_on_the_way_between_two_commands_wheels_keep_their_limit_too(targets: Array, hard: list[bool]) -> None:
     bases = Bases(**{name: BaseController(DRIVE, 1, HZ).numbers[name] for name in ("most_wheel_speed", "jerk", "stop")})

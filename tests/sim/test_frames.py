@@ -138,9 +138,7 @@ def play(
         every += [robots.physics_state, *(field.reshape(n, -1) for field in vars(true).values())]
         if takes_goals:
             every.append(np.array([[len(robots.bridge.take_results(sim))] for sim in range(n)]))
-        rows.append(
-            np.where(robots.running[:, None], np.concatenate(every, axis=1), 0.0)
-        )  # those apart: nothing
+        rows.append(np.where(robots.running[:, None], np.concatenate(every, axis=1), 0.0))  # those apart: nothing
     assert alone is None or robots._frames._is_prepared
     robots.close()
     return np.array(rows)

@@ -1,7 +1,6 @@
 """The estimate of how hard an arm presses, at made-up efforts."""
 
 import numpy as np
-import pytest
 
 from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.control.arm.controller import ArmController

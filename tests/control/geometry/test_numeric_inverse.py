@@ -117,7 +117,7 @@ def orientation_cost(kinematics: ForwardKinematics, q: Array, pose: Array) -> fl
 @pytest.mark.parametrize("joints", [4, 5])
 def test_few_joints_reach_the_position_and_as_much_of_the_orientation_as_can_be_had(joints: int) -> None:
     kinematics = arm(joints)
-    for seed, q in enumerate(postures(kinematics, 4)):
+    for seed, q in enumerate(postures(kinematics, 3)):
         pose = kinematics.tool(q)
         pose[:3, :3] = pose[:3, :3] @ Rotation.random(random_state=seed).as_matrix()
         found = kinematics.solve(pose, q)
@@ -127,7 +127,7 @@ def test_few_joints_reach_the_position_and_as_much_of_the_orientation_as_can_be_
         assert turned == pytest.approx(found.turned[0], abs=1e-6)
         best = min(orientation_cost(kinematics, one, pose) for one in found.postures)
         bounds = list(zip(kinematics.lower, kinematics.upper, strict=True))
-        for start in (q, *postures(kinematics, 4, seed)):
+        for start in (q, *postures(kinematics, 2, seed)):
             place = {"type": "eq", "fun": lambda at, pose=pose: kinematics.tool(at)[:3, 3] - pose[:3, 3]}
             other = minimize(
                 lambda at, pose=pose: orientation_cost(kinematics, at, pose),

@@ -76,7 +76,7 @@ def end(rig: Rig, due: Counter) -> None:
     assert rig.manager.feedback(0) is None
 
 
-@settings(max_examples=80)
+@settings(max_examples=50)
 @given(st.lists(actions, min_size=1, max_size=6))
 @example([(("goal", {"joint_target": tuple(HOME[:6] + 0.3), "preempt": False}), 3), (("goal", {"gripper": 0.0}), 0)])
 def test_limits_hold_and_every_goal_has_one_result(script: list) -> None:

@@ -233,7 +233,7 @@ def test_a_goal_in_a_brake_waits_for_its_end_or_preempts_it(preempt: bool) -> No
 latencies = st.lists(st.integers(1, 30) | st.integers(1, 2 * TIMEOUT) | st.just(NEVER), max_size=12)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.lists(actions, min_size=1, max_size=6), latencies, st.integers(MIN_LEAD, 40))
 def test_limits_hold_and_every_goal_has_one_result_with_a_late_planner(
     script: list, latencies: list[int], lead: int

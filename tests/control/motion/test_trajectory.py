@@ -273,7 +273,7 @@ class Played(TrajectoryPlayer):
         return np.where(np.array(before)[:, None], np.stack(self._fields), np.nan)
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 3000), st.integers(0, 2000)), max_size=12))
 def test_every_row_is_played_once_and_in_order(script: list[tuple[int, int, int]]) -> None:
     player = Played(4)

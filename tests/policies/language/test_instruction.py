@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bhd_lerobot.bodies.tabletop import COLOURS, KINDS
@@ -109,6 +109,7 @@ def test_it_means_this_object_and_this_action(instruction: str, target: int, las
     assert {step.object for step in made.steps} == {target}
 
 
+@settings(max_examples=40)
 @given(scenes(), st.data())
 def test_every_generated_instruction_means_its_target(scene: list[SceneObject], data: st.DataObject) -> None:
     target = data.draw(st.sampled_from(scene)).index
@@ -247,6 +248,7 @@ def test_an_ambiguous_instruction_is_answered_with_exact_ones(instruction: str, 
     assert goals == {parse(instruction).goal}
 
 
+@settings(max_examples=50)
 @given(st.text(max_size=30))
 def test_any_text_is_planned_or_refused(text: str) -> None:
     for instruction in (text, f"pick up the {text} cup", f"拿起{text}杯子"):

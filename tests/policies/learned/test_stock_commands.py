@@ -144,14 +144,16 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Tr
     return make
 
 
-@pytest.mark.thorough(but=1)
-@pytest.mark.parametrize(
-    ("kind", "program"),
-    [
-        *(("bhd_mlp", "lerobot-train"), ("act", "bhd-train")),
-        *((kind, program) for kind in ("bhd_pixels", "bhd_cnn") for program in ("lerobot-train", "bhd-train")),
-    ],
+TRAININGS = (
+    ("bhd_mlp", "lerobot-train"),
+    ("act", "bhd-train"),
+    ("bhd_pixels", "bhd-train"),
+    ("bhd_cnn", "lerobot-train"),
 )
+
+
+@pytest.mark.thorough(but=1)
+@pytest.mark.parametrize(("kind", "program"), TRAININGS)
 def test_a_checkpoint_does_the_same_in_all_three_programs(kind, program, trained, tmp_path):
     made = trained(kind, program)
     assert (made.checkpoint / CONTRACT_FILE).exists() == (program == "bhd-train")
@@ -172,8 +174,9 @@ def test_a_checkpoint_does_the_same_in_all_three_programs(kind, program, trained
 
 
 @pytest.mark.thorough(but=1)
-@pytest.mark.parametrize("kind", ["bhd_mlp", "bhd_cnn", "bhd_pixels", "bhd_perception"])
+@pytest.mark.parametrize("kind", ["bhd_cnn", "bhd_pixels", "bhd_perception"])
 def test_both_loaders_and_a_resumed_run_give_the_same_weights(kind: str, tmp_path: Path) -> None:
+    """Of a policy that sees; `tests/training/test_train.py` has the others."""
     once = {"save_freq": 1, "threads": 1, "num_workers": 0}
     for run, budget in (("whole", 4.0), ("stock_loader", 1e-6)):
         assert train.main(training(tmp_path, kind, run, **once, budget_gib=budget)) == 0
@@ -188,8 +191,7 @@ def test_both_loaders_and_a_resumed_run_give_the_same_weights(kind: str, tmp_pat
 @pytest.mark.thorough
 def test_a_process_of_lerobots_loads_every_checkpoint_with_its_processors(trained):
     """It imports our package as a plug-in, and nothing else of it; here, other tests have imported everything."""
-    made = [("bhd_mlp", "lerobot-train"), *((kind, "bhd-train") for kind in ("act", "bhd_pixels", "bhd_cnn"))]
-    paths = [str(trained(*one).checkpoint) for one in made]
+    paths = [str(trained(*one).checkpoint) for one in TRAININGS]
     program = f"""
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors

@@ -21,7 +21,7 @@ from bhd_lerobot.policies.perception.modeling_perception import PerceptionPolicy
 from bhd_lerobot.tasks.variation import RandomisationConfig
 from tests.policies.perception.rig import FEATURES, HEIGHT, IMAGE, WIDTH, config, painted, states
 
-STEPS = 150
+STEPS = 120
 
 
 def batch(count: int = 16) -> dict[str, Tensor]:

@@ -20,6 +20,7 @@ from tests.cases import each_case
 from tests.policies.perception.rig import HEIGHT, IMAGE, WIDTH, config, painted, save, states
 
 CHUNK = 4
+TABLES, STEPS = 3, 60
 NAMES = {OBS_STATE: {"names": [f"joint.{which}" for which in (*"abcdefg", *["vel"] * 7)]}}
 
 
@@ -58,14 +59,14 @@ def present(samples: dict[str, Tensor], frame: int = 0) -> dict[str, Tensor]:
 def test_it_learns_to_look_at_what_is_named() -> None:
     policy = PixelsPolicy(made(freeze=False, pointing_weight=1.0, n_cells=10_000))
     optimizer = torch.optim.AdamW(policy.get_optim_params(), 5e-3)
-    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 90)
+    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
     task = {"min_objects": 2, "max_objects": 2}
-    samples = batch(5, **task)
-    other = batch(5, **task, swap=True)  # the same tables, and it is asked for the other object
+    samples = batch(TABLES, **task)
+    other = batch(TABLES, **task, swap=True)  # the same tables, and it is asked for the other object
     assert torch.equal(samples[IMAGE][:, 0].sum((2, 3)), other[IMAGE][:, 0].sum((2, 3)))
     both = {key: torch.cat([samples[key], other[key]]) for key in samples}
     policy.train()
-    for _ in range(90):
+    for _ in range(STEPS):
         loss, parts = policy.forward(both)
         optimizer.zero_grad()
         loss.backward()
@@ -76,11 +77,11 @@ def test_it_learns_to_look_at_what_is_named() -> None:
     for asked in (samples, other):
         cells, where = policy._cells(asked[IMAGE][:, 0])
         _, attention = policy._see(cells, asked[OBS_LANGUAGE_TOKENS])
-        cell = where[torch.arange(5), attention.argmax(1)]
+        cell = where[torch.arange(TABLES), attention.argmax(1)]
         columns = policy.perception._pixels.shape[1]
         pixel = policy.perception._pixels[cell // columns, cell % columns]
-        table = asked[OBS_ENV_STATE][:, 0].reshape(5, 5, 16)
-        true = table[torch.arange(5), table[..., 1].argmax(1), 3:6].double().numpy()
+        table = asked[OBS_ENV_STATE][:, 0].reshape(TABLES, 5, 16)
+        true = table[torch.arange(TABLES), table[..., 1].argmax(1), 3:6].double().numpy()
         apart = np.linalg.norm(policy.config.projection.pixels(true) - pixel.numpy(), axis=-1)
         assert np.all(apart < 8)
 
