@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from bhd_lerobot.bodies.body import Drive
 from bhd_lerobot.bodies.turtlebot3 import turtlebot3_burger
 from bhd_lerobot.control.drive import BaseController
-from bhd_lerobot.control.estop_word import EstopWord
-from bhd_lerobot.control.fifo import CommandFifo, StateRing
+from bhd_lerobot.control.fifo import StateRing
 from bhd_lerobot.control.messages import NANOSECONDS, SendResult, Setpoint
 from bhd_lerobot.control.plant import Plant, PlantReading
 from tests.control import arm_rig
@@ -80,7 +79,6 @@ class Rig(arm_rig.Rig):
         return int(self.cerebellum.refusals[reason, 0])
 
 
-FIFO_SHAPE = (3, 2, 8)  # n, width, capacity
 STATE = np.dtype([("number", np.int64), ("copies", np.int64, (500,))])
 
 
@@ -92,27 +90,7 @@ def shared_block(path: Path, size: int = 0) -> mmap.mmap:
         return mmap.mmap(file.fileno(), 0)
 
 
-def push_commands(path: Path, count: int) -> None:
-    fifo = CommandFifo(*FIFO_SHAPE, buffer=shared_block(path))
-    for number in range(count):
-        values = np.full((3, 2), float(number))
-        mask = np.array([True, number % 2 == 0, number % 3 == 0])
-        while (mask := mask & ~fifo.push(number, number, values, mask)).any():
-            pass
-
-
 def publish(ring: StateRing, number: int) -> None:
     state = np.zeros((), STATE)
     state["number"] = state["copies"] = number
     ring.publish(state)
-
-
-def publish_states(path: Path, count: int) -> None:
-    ring = StateRing(STATE, 2, buffer=shared_block(path))
-    for number in range(1, count + 1):
-        publish(ring, number)
-
-
-def set_word(path: Path) -> None:
-    """Press the emergency stop of the second of two simulations."""
-    EstopWord(2, shared_block(path)).press(np.array([1]))

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +8,6 @@ from bhd_lerobot.control.kernels import as_objects
 from bhd_lerobot.control.record import NEVER, new_states
 from bhd_lerobot.errors import ConfigError
 from tests.control import support
-from tests.forks import Fork
 
 
 def push(fifo: CommandFifo, number: int, due: int | None = None, mask: np.ndarray | None = None) -> list[bool]:
@@ -122,21 +119,6 @@ def test_a_queue_has_room_and_the_stated_size() -> None:
         CommandFifo(1, 2, 257)
 
 
-def test_a_queue_between_two_processes_loses_and_reorders_nothing(tmp_path: Path) -> None:
-    count, path = 1000, tmp_path / "block"
-    block = support.shared_block(path, CommandFifo.nbytes(support.FIFO_SHAPE[0]))
-    reader = Reader(CommandFifo(*support.FIFO_SHAPE, buffer=block))
-    process = Fork(support.push_commands, path, count)
-    for number in range(count):
-        for sim in range(3):
-            if number % (sim + 1) == 0:
-                while (popped := reader.pop(sim)) is None:
-                    assert process.poll() is None or len(reader.fifo) > 0
-                assert popped == number
-    assert process.wait() == 0
-    assert [reader.pop(sim) for sim in range(3)] == [None] * 3
-
-
 def test_a_reader_that_is_interrupted_by_the_writer_never_sees_half_a_state() -> None:
     """The writer laps the reader in the middle of its copy; the reader notices and reads again."""
     ring = StateRing(support.STATE, 2)
@@ -169,23 +151,6 @@ def test_a_reader_that_is_interrupted_by_the_writer_never_sees_half_a_state() ->
     assert latest is not None
     assert int(latest["number"]) == 7
     assert (latest["copies"] == 7).all()
-
-
-def test_states_from_another_process_are_never_torn(tmp_path: Path) -> None:
-    count = 20_000
-    path = tmp_path / "block"
-    ring = StateRing(support.STATE, 2, support.shared_block(path, StateRing.nbytes(support.STATE, 2)))
-    process = Fork(support.publish_states, path, count)
-    last = 0
-    while last < count:
-        latest = ring.latest()
-        if latest is None:
-            assert process.poll() is None or len(ring)
-            continue
-        assert (latest["copies"] == latest["number"]).all()
-        assert int(latest["number"]) >= last
-        last = int(latest["number"])
-    assert process.wait() == 0
 
 
 @given(steps=st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12)), max_size=40), capacity=st.integers(2, 7))

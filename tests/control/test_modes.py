@@ -1,7 +1,6 @@
 """The mode machine, edge by edge, on a virtual clock."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,13 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bhd_lerobot.control.estop_word import EstopWord
 from bhd_lerobot.control.messages import Limit, Mode, Reason, Request, Watchdog
 from bhd_lerobot.control.record import command_age_ns
 from tests.cases import each_case
 from tests.control import support
 from tests.control.support import HZ, TICK_NS, Rig
-from tests.forks import Fork
 
 TIMEOUT_TICKS = HZ // 2
 
@@ -367,13 +364,12 @@ def test_a_press_in_the_middle_of_a_reset_is_not_lost() -> None:
     assert rig.mode == Mode.ESTOP
 
 
-def test_another_process_can_stop_one_of_two_robots(tmp_path: Path) -> None:
-    path = tmp_path / "word"
-    rig = Rig(2, estop=EstopWord(2, support.shared_block(path, 48)))
+def test_one_of_two_robots_can_be_stopped() -> None:
+    rig = Rig(2)
     rig.send(0.2)
     rig.tick(20)
     assert (rig.cerebellum.mode == Mode.TRACKING).all()
-    assert Fork(support.set_word, path).wait() == 0
+    rig.cerebellum.estop.press(np.array([1]))
     rig.send(0.2)
     rig.tick()
     assert rig.cerebellum.mode.tolist() == [Mode.TRACKING, Mode.ESTOP]

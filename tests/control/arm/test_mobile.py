@@ -177,16 +177,6 @@ def test_while_a_goal_is_followed_the_base_comes_to_rest_and_holds_only_once_it_
     assert (slower <= 0).all()
 
 
-def test_a_setpoint_ends_the_goal_and_drives_again() -> None:
-    rig = Rig()
-    assert rig.go(**SWEEP) is None
-    rig.tick(100)
-    assert rig.twist == [0.0, 0.0]
-    rig.stream(MOVING, 16)
-    assert rig.results() == [("1", ResultCode.REPLACED_BY_SETPOINT)]
-    assert min(rig.twist) > 0.1
-
-
 def block_wheels(rig: Rig) -> None:
     rig.plant.stuck[:, WHEELS] = True
 
