@@ -13,6 +13,40 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="session")
+def three_episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three short episodes of a toy; copy it before it is changed, as the others."""
+    return toy(tmp_path_factory, 3)
+
+
+@pytest.fixture(scope="session")
+def six_episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six of them."""
+    return toy(tmp_path_factory, 6)
+
+
+@pytest.fixture(scope="session")
+def video_episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three with a camera."""
+    return toy(tmp_path_factory, 3, video=True)
+
+
+def toy(tmp_path_factory: pytest.TempPathFactory, episodes: int, *, video: bool = False) -> Path:
+    from tests.datasets.edit_support import record
+
+    return record(tmp_path_factory.mktemp("toy") / "d", list(range(episodes)), video=video)
+
+
+@pytest.fixture(scope="session")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A base without a camera: three episodes of 3 s."""
+    from tests.recording.support import run_record
+
+    root = tmp_path_factory.mktemp("looked_at") / "drives"
+    run_record(root, n_envs=2, seed=4)
+    return root
+
+
+@pytest.fixture(scope="session")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A base with a camera: three episodes of 20 frames."""
     from tests.recording.support import run_record

@@ -15,26 +15,23 @@ def save(
     progress: Path,
     episodes: int,
     *,
-    video: bool = False,
     finalize: bool = False,
     sessions: int = 1,
     die_at: int | None = None,
 ) -> None:
-    """Save episodes, and perhaps finalise, in some sessions; write down what is done.
+    """Save episodes with a camera, and perhaps finalise, in some sessions; write down what is done.
 
     With `die_at`, die in the last episode, or while finalising, before the change of the disk with this number.
     """
     done = os.open(progress, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     recorder = None
     for _ in range(sessions):
-        if recorder is not None or root.exists():
-            recorder = support.resume(root, video=video)
-        else:
-            recorder = support.create(root, video=video)
+        make = support.resume if recorder is not None or root.exists() else support.create
+        recorder = make(root, video=True)
         for episode in range(episodes):
             if die_at is not None and not finalize and episode == episodes - 1:
                 disk._before_step = _dying(die_at)
-            index = support.record(recorder, video=video)
+            index = support.record(recorder, video=True)
             os.write(done, f"saved {index}\n".encode())
         if finalize:
             if die_at is not None:

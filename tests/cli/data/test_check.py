@@ -12,19 +12,11 @@ from bhd_lerobot.bodies.registry import OF_FILES
 from bhd_lerobot.cli.data import check, main, repair
 from bhd_lerobot.cli.data.check import limits_of
 from bhd_lerobot.registry import robot_configs
-from tests.recording.support import run_record
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("check") / "d"
-    run_record(root, n_envs=2, seed=4)
-    return root
-
-
-def broken(recorded: Path, tmp_path: Path, value: float) -> Path:
+def broken(drives: Path, tmp_path: Path, value: float) -> Path:
     """A copy with an applied forward speed that is not what was recorded."""
-    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+    root = Path(shutil.copytree(drives, tmp_path / "d"))
     path = next((root / "data").rglob("*.parquet"))
     table = pq.read_table(path)
     rows = table.to_pydict()
@@ -33,15 +25,15 @@ def broken(recorded: Path, tmp_path: Path, value: float) -> Path:
     return root
 
 
-def test_errors_and_with_strict_warnings_end_with_status_1(recorded: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+def test_errors_and_with_strict_warnings_end_with_status_1(drives: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    root = broken(recorded, tmp_path, 0.5)
+    root = broken(drives, tmp_path, 0.5)
     assert main.main(["check", str(root)]) == 1  # statistics are not those of the data
     text = capsys.readouterr().out
     assert "the robot's limits are -0.22 and 0.22" in text
     assert "not valid, 1 error, " in text
     shutil.rmtree(root)
-    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+    root = Path(shutil.copytree(drives, tmp_path / "d"))
     (root / "data/chunk-000/file-009.parquet").write_bytes(b"left")
     assert main.main(["check", str(root)]) == 0
     assert main.main(["check", str(root), "--strict"]) == 1
@@ -69,11 +61,11 @@ def test_every_robot_of_ours_has_the_limits_of_its_configuration() -> None:
 @pytest.mark.parametrize(
     ("command", "message"), [("check", "nothing was changed"), ("repair", "run it again to finish")]
 )
-def test_ctrl_c_is_a_line_and_status_130(recorded: Path, capsys, monkeypatch, command: str, message: str) -> None:
+def test_ctrl_c_is_a_line_and_status_130(drives: Path, capsys, monkeypatch, command: str, message: str) -> None:
     def interrupted(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
     module = {"check": check, "repair": repair}[command]
     monkeypatch.setattr(module, command, interrupted)
-    assert main.main([command, str(recorded)]) == 130
+    assert main.main([command, str(drives)]) == 130
     assert capsys.readouterr().err == f"Stopped; {message}.\n"

@@ -14,16 +14,11 @@ from bhd_lerobot.errors import ConfigError
 from tests.datasets.edit_support import content, record
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Path:
-    return record(tmp_path_factory.mktemp("edit") / "d", list(range(6)))
-
-
 @pytest.mark.law
-def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) -> None:
-    whole = content(recorded)
-    two, more = shutil.copytree(recorded, tmp_path / "two"), record(tmp_path / "more", [6, 7])
-    merged = ["merge", str(more), str(recorded), str(two), "--output", str(tmp_path / "all")]
+def test_merge_filter_delete_split_mark(six_episodes: Path, tmp_path: Path, capsys) -> None:
+    whole = content(six_episodes)
+    two, more = shutil.copytree(six_episodes, tmp_path / "two"), record(tmp_path / "more", [6, 7])
+    merged = ["merge", str(more), str(six_episodes), str(two), "--output", str(tmp_path / "all")]
     assert main.main(merged) == 0
     assert content(tmp_path / "all") == content(more) + whole
     assert main.main(["delete", str(tmp_path / "all"), "--episodes", "0-1"]) == 0
@@ -35,20 +30,20 @@ def test_merge_filter_delete_split_mark(recorded: Path, tmp_path: Path, capsys) 
     arguments = ["filter", str(two), "--episodes", "0-3", "--outcome", "stuck,timeout", "--output", str(tmp_path / "s")]
     assert main.main(arguments) == 0
     assert [one.task for one in content(tmp_path / "s")] == [whole[1].task, whole[3].task]
-    assert main.main(["filter", str(recorded), "--min_score", "1", "--output", str(tmp_path / "best")]) == 0
+    assert main.main(["filter", str(six_episodes), "--min_score", "1", "--output", str(tmp_path / "best")]) == 0
     assert content(tmp_path / "best") == whole[4:]
-    assert main.main(["split", str(recorded), "--parts", "train=0.5,val=0.5", "--output", str(tmp_path / "p")]) == 0
+    assert main.main(["split", str(six_episodes), "--parts", "train=0.5,val=0.5", "--output", str(tmp_path / "p")]) == 0
     assert content(tmp_path / "p/train") + content(tmp_path / "p/val") == whole
-    assert main.main(["split", str(recorded), "--parts", "a=0,5;b=1-2", "--output", str(tmp_path / "q")]) == 0
+    assert main.main(["split", str(six_episodes), "--parts", "a=0,5;b=1-2", "--output", str(tmp_path / "q")]) == 0
     assert content(tmp_path / "q/a") == [whole[0], whole[5]]
     out = capsys.readouterr().out
     assert f"{tmp_path / 'all'}: 8 episodes" in out
     assert f"left out: 6 episodes of {two}, which a dataset before it has, too: 0, 1, 2, 3, 4, 5\n" in out
-    assert content(recorded) == whole
+    assert content(six_episodes) == whole
 
 
-def test_check_with_fix(recorded: Path, tmp_path: Path, capsys) -> None:
-    root = shutil.copytree(recorded, tmp_path / "d")
+def test_check_with_fix(six_episodes: Path, tmp_path: Path, capsys) -> None:
+    root = shutil.copytree(six_episodes, tmp_path / "d")
     (root / "meta/stats.json").unlink()
     assert main.main(["check", str(root), "--no-videos"]) == 1
     assert "bhd-data check --fix" in " ".join(capsys.readouterr().out.replace("│", " ").split())

@@ -20,13 +20,9 @@ def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
 
 
-def test_some_episodes_by_number_and_by_outcome(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
+def test_some_episodes_by_outcome(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:
     assert main.main(["push", str(lesson), "me/d"]) == 0
     capsys.readouterr()
-    assert main.main(["pull", "me/d", f"--root={tmp_path / 'a'}", "--episodes=0,3-4"]) == 0
-    output = capsys.readouterr().out
-    assert "3 episodes of 6: 0,3-4" in output
-    assert '--dataset.episodes="[0, 3, 4]"' in output
     assert main.main(["pull", "me/d", f"--root={tmp_path / 'b'}", "--outcome=success", "--min_score=0.3"]) == 0
     assert "2 episodes of 6: 4-5" in capsys.readouterr().out
     assert main.main(["pull", "me/d", f"--root={tmp_path / 'c'}", "--outcome=fault"]) == 2

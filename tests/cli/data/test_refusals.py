@@ -1,6 +1,7 @@
 """Whatever `bhd-data` refuses ends in a message and status 2, and changes nothing."""
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,6 @@ import pytest
 from bhd_lerobot.cli.data import main
 from tests.cases import each_case
 from tests.datasets import support
-from tests.datasets.edit_support import record
 from tests.ros2.bag.support import drive, write
 
 IMPORT = "import bag --repo_id=t/t --root=x --task=Drive."
@@ -25,13 +25,16 @@ REFUSALS = [
     ("pull s3://bucket/data here", "unexpected argument: here. Name the folder to download to with --root=FOLDER."),
     ("merge d --output x", "at least two"),
     ("merge d none --output x", "does not exist"),
+    ("merge d d/../d --output x", "more than once"),
     ("filter d --outcome sucess --output x", "Did you mean 'success'"),
     ("filter d --outcome stuck --output x", "No episode of"),
     ("filter none --outcome all --output x", "does not exist"),
     ("filter d --output x", "needs a selection of episodes: --episodes"),
     ("filter d --min_score 2 --output x", "0 to 1"),
     ("filter d --episodes 0-2,1 --output x", "Episode 1 is named twice"),
+    ("filter d --episodes 0 --output d/new", "which must not change"),
     ("delete d --episodes 9", "no episode 9"),
+    ("delete d --episodes 0-5", "No episode is left"),
     ("delete d --episodes x", "names no episode"),
     ("delete d --episodes 5-1", "runs backwards; write 1-5"),
     ("delete d --episodes 0-99999999999", "at most 1000000"),
@@ -39,6 +42,7 @@ REFUSALS = [
     ("split d --parts a=0.5 --shuffle_seed -1 --output x", "--shuffle_seed is -1; it must be at least 0"),
     ("split d --parts a=0.7,b=0.7 --output x", "at most 1 together"),
     ("split d --parts a=0.01 --output x", "would have no episode"),
+    ("split d --parts a=0-1;b=1 --output x", "'a' and to 'b'"),
     ("split d --parts a,b --output x", "not one name and its part"),
     ("split d --parts ../a=0.5 --output x", "not one name and its part"),
     ("split d --parts a=0.5,b=3 --output x", "at most 1 together"),
@@ -89,7 +93,17 @@ REFUSALS = [
     ("push d me/a --tag=", "--tag is empty"),
     ("push a\0b me/a", "cannot be the folder"),
     ("push ~nobodyatall/d me/a", "cannot be the folder"),
+    ("push d foo://b/d", "Protocol not known: foo. Known protocols: "),
     ("push d ftp://", "names no folder"),
+    ("push d s3://", "s3:// cannot hold a dataset: it names no folder"),
+    ("push d s3:///d", "names no bucket"),
+    ("push d file://", "names no folder, as in file:///folder"),
+    ("push d ://b/d", "names no protocol"),
+    ("push d http://127.0.0.1/d", "cannot be written, listed and read"),
+    ("push d zip://d.zip", "cannot hold a dataset"),
+    ("push d simplecache::s3://bucket/d", "a chain"),
+    ("push d 'memory://b/a\0b'", "characters that are not valid in a URL"),
+    ("push d 'memory://b/a\nb'", "characters that are not valid in a URL"),
     ("pull", "Give one source"),
     ("pull me/a --repo_id=me/b", "Give one source"),
     ("pull memory://b/d", "Give the target"),
@@ -106,9 +120,9 @@ REFUSALS = [
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(six_episodes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("refusals")
-    record(folder / "d", list(range(6)))
+    shutil.copytree(six_episodes, folder / "d")
     support.create(folder / "empty").finalize()
     write(folder / "bag", drive())
     (folder / "file").write_text("not a dataset")

@@ -69,14 +69,7 @@ def measured(tmp_path_factory):
     return root
 
 
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory):
-    root = tmp_path_factory.mktemp("timing") / "simulated"
-    run_record(root, seed=4)
-    return root
-
-
-def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
+def test_in_lockstep_the_tolerance_has_no_effect(drives, tmp_path):
     """A scan is up to 0.2 s old here, and still no frame is late, no episode is bad and no byte is another one."""
     strict = {"timing__max_age_s": 1e-6, "timing__max_late_frames": 0.0, "timing__reject": "true"}
     result, _ = run_record(tmp_path / "strict", seed=4, **strict)
@@ -85,7 +78,7 @@ def test_in_lockstep_the_tolerance_has_no_effect(simulated, tmp_path):
     assert max(columns[keys.AGE]) > 0.01
     for key in keys.PUNCTUALITY:
         assert not any(columns[key])
-    assert columns == data_columns(simulated)
+    assert columns == data_columns(drives)
 
 
 def test_info_holds_what_was_measured(measured, capsys, monkeypatch):
@@ -129,10 +122,3 @@ def test_an_invalid_timing_is_named(tmp_path, capsys, metadata, words):
     save(tmp_path / "d", [(columns, metadata)])
     assert main.main(["info", str(tmp_path / "d")]) == 2
     assert words in capsys.readouterr().err
-
-
-def test_a_dataset_of_another_program(tmp_path, capsys):
-    feature = {"x": {"dtype": "float32", "shape": (1,), "names": None}}
-    save(tmp_path / "d", [({"x": np.zeros(5, np.float32)}, {})], feature)
-    assert main.main(["info", str(tmp_path / "d")]) == 0
-    assert "timing" not in capsys.readouterr().out

@@ -36,14 +36,9 @@ WRONG: dict[str, tuple[Any, ...]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> Path:
-    return edit_support.record(tmp_path_factory.mktemp("info") / "d", [0, 1, 2])
-
-
 @pytest.fixture
-def info(recorded: Path) -> dict[str, Any]:
-    return json.loads((recorded / "meta/info.json").read_text())
+def info(three_episodes: Path) -> dict[str, Any]:
+    return json.loads((three_episodes / "meta/info.json").read_text())
 
 
 def test_missing_keys_have_lerobots_defaults(info) -> None:
@@ -54,10 +49,12 @@ def test_missing_keys_have_lerobots_defaults(info) -> None:
     assert checked_info({**info, "more": [1]}, "d") == {**info, "more": [1]}
 
 
-def test_datasets_without_the_optional_keys_can_be_edited_and_repaired(recorded: Path, info, tmp_path: Path) -> None:
+def test_datasets_without_the_optional_keys_can_be_edited_and_repaired(
+    three_episodes: Path, info, tmp_path: Path
+) -> None:
     optional = [key for key in info if key not in REQUIRED]
     for left_out in ([key] for key in [*optional, None]):
-        root = Path(shutil.copytree(recorded, tmp_path / "d"))
+        root = Path(shutil.copytree(three_episodes, tmp_path / "d"))
         gone = optional if left_out == [None] else left_out
         (root / "meta/info.json").write_text(json.dumps({key: v for key, v in info.items() if key not in gone}))
         keep(root, [0, 2], tmp_path / "kept")
@@ -68,8 +65,8 @@ def test_datasets_without_the_optional_keys_can_be_edited_and_repaired(recorded:
         shutil.rmtree(tmp_path / "kept")
 
 
-def test_invalid_values_are_named_and_nothing_is_changed(recorded: Path, info, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+def test_invalid_values_are_named_and_nothing_is_changed(three_episodes: Path, info, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(three_episodes, tmp_path / "d"))
     cases = [(key, value) for key, values in WRONG.items() for value in values]
     for key, value in [*cases, *((key, KeyError) for key in REQUIRED)]:
         changed = {**info, key: value}

@@ -118,12 +118,6 @@ def test_an_iteration_that_was_left_is_not_gone_on_with() -> None:
     assert order.state_dict() == {"epoch": 2, "position": 0}
 
 
-def test_a_state_at_the_end_of_an_epoch_continues_with_the_next() -> None:
-    order = BatchOrder(SAMPLES, 5, 3)
-    order.load_state_dict({"epoch": 0, "position": len(SAMPLES)})
-    assert epochs(order, 1) == epochs(BatchOrder(SAMPLES, 5, 3), 2)[1:]
-
-
 def test_weights_say_how_often_a_sample_is_drawn() -> None:
     weights = torch.tensor([0.0, 1.0, 3.0])
     order = BatchOrder(torch.tensor([7, 8, 9]), 2, 0, weights=weights)

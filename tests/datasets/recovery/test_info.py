@@ -17,11 +17,6 @@ from tests.datasets.edit_support import assert_valid, content, record
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("info") / "d", [0, 1, 2], video=True)
-
-
-@pytest.fixture(scope="module")
 def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("info") / "other", [5], video=True)
 
@@ -35,8 +30,8 @@ def without_features(path: Path) -> None:
 
 
 @pytest.mark.parametrize("break_it", [torn, without_features, Path.unlink, lambda path: path.write_text("[]")])
-def test_the_advice_works(recorded, other, tmp_path, capsys, break_it):
-    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+def test_the_advice_works(video_episodes, other, tmp_path, capsys, break_it):
+    root = Path(shutil.copytree(video_episodes, tmp_path / "d"))
     break_it(root / "meta/info.json")
     for command in ("info", "check", "repair", "view"):
         assert main.main([command, str(root)]) == 2
@@ -44,7 +39,7 @@ def test_the_advice_works(recorded, other, tmp_path, capsys, break_it):
         assert advice is not None, command
     assert main.main([*advice[1].split(), str(other)]) == 0
     assert "3 episodes, 18 frames" in capsys.readouterr().out
-    assert content(root) == content(recorded)
+    assert content(root) == content(video_episodes)
     assert_valid(root)
     with support.resume(root, video=True) as recorder:  # it is still the recorder's own
         support.record(recorder, video=True)
@@ -61,8 +56,10 @@ def test_an_interrupted_recording_of_ours_loses_nothing(other: Path, tmp_path: P
     assert [episode.metadata["seed"] for episode in dataset_info(root).episodes] == [0, 1, 2]
 
 
-def test_info_that_is_not_needed_or_cannot_be_used_changes_nothing(recorded: Path, other: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+def test_info_that_is_not_needed_or_cannot_be_used_changes_nothing(
+    video_episodes: Path, other: Path, tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(video_episodes, tmp_path / "d"))
     stranger = tmp_path / "stranger"
     features = {"action": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
     DatasetRecorder.create("t/none", 10, features, robot_type="toy", root=stranger, recording={}).finalize()
@@ -87,8 +84,8 @@ def test_info_that_is_not_needed_or_cannot_be_used_changes_nothing(recorded: Pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "list.json", "stranger", "v2.json"]
 
 
-def test_a_wrong_count_of_frames_leads_to_check_fix(recorded: Path, tmp_path: Path, capsys) -> None:
-    root = Path(shutil.copytree(recorded, tmp_path / "d"))
+def test_a_wrong_count_of_frames_leads_to_check_fix(video_episodes: Path, tmp_path: Path, capsys) -> None:
+    root = Path(shutil.copytree(video_episodes, tmp_path / "d"))
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps({**info, "total_frames": 7}))
     assert main.main(["repair", str(root)]) == 2
@@ -96,12 +93,12 @@ def test_a_wrong_count_of_frames_leads_to_check_fix(recorded: Path, tmp_path: Pa
     assert advice is not None
     assert main.main(advice[1].split()) == 0
     assert main.main(["repair", str(root)]) == 0
-    assert content(root) == content(recorded)
+    assert content(root) == content(video_episodes)
 
 
-def test_repair_never_advises_repair(recorded: Path, tmp_path: Path) -> None:
+def test_repair_never_advises_repair(video_episodes: Path, tmp_path: Path) -> None:
     for pattern in ("data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4", "meta/tasks.parquet"):
-        root = Path(shutil.copytree(recorded, tmp_path / pattern[:4]))
+        root = Path(shutil.copytree(video_episodes, tmp_path / pattern[:4]))
         path = next(root.glob(pattern))
         path.write_bytes(bytes(30) if path.suffix == ".parquet" else b"video")
         try:
@@ -113,7 +110,7 @@ def test_repair_never_advises_repair(recorded: Path, tmp_path: Path) -> None:
         shutil.rmtree(root)
 
 
-def test_a_folder_of_datasets_names_them(recorded: Path, other: Path, tmp_path: Path, capsys) -> None:
+def test_a_folder_of_datasets_names_them(video_episodes: Path, other: Path, tmp_path: Path, capsys) -> None:
     for name in ("b", "a"):
         shutil.copytree(other, tmp_path / name)
     (tmp_path / "link").symlink_to(tmp_path / "gone")

@@ -9,18 +9,10 @@ import pytest
 
 from bhd_lerobot.datasets.remote.hub import HubDataset
 from bhd_lerobot.datasets.remote.store import StoreDataset
-from tests.datasets.edit_support import record
 from tests.fake_hub.fixtures import stored as stored_on
 from tests.fake_hub.hub import FakeHub
 
-EPISODES = 3
 KEYS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1"}
-
-
-@pytest.fixture(scope="session")
-def few_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of `EPISODES` episodes in one data and one video file; copy it before it is changed."""
-    return record(tmp_path_factory.mktemp("few_files") / "d", list(range(EPISODES)), video=True)
 
 
 @pytest.fixture(scope="session")
@@ -40,24 +32,11 @@ def s3_url() -> Iterator[str]:
         server.stop()
 
 
-@pytest.fixture(params=["memory", "file"])
-def near_url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A place that needs no server: for what happens on our side of the store."""
-    return _place(request, tmp_path, monkeypatch)
-
-
-def _place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "file":
-        return f"file://{tmp_path}/there/d"
-    if request.param == "memory":
-        fsspec.filesystem("memory").store.clear()
-        return "memory://bucket/there/d"
-    use_s3(request.getfixturevalue("s3_url"), monkeypatch)
-    s3 = fsspec.filesystem("s3")
-    if s3.exists("bucket"):
-        s3.rm("bucket", recursive=True)
-    s3.mkdir("bucket")
-    return "s3://bucket/there/d"
+@pytest.fixture
+def near_url() -> str:
+    """A place that needs no server: for what happens on our side of the store, whichever it is."""
+    fsspec.filesystem("memory").store.clear()
+    return "memory://bucket/there/d"
 
 
 @dataclass(frozen=True)
@@ -79,7 +58,16 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     """A place of each kind."""
     if request.param == "hub":
         return Place("me/d", request.getfixturevalue("hub"))
-    return Place(_place(request, tmp_path, monkeypatch))
+    if request.param == "memory":
+        return Place(request.getfixturevalue("near_url"))
+    if request.param == "file":
+        return Place(f"file://{tmp_path}/there/d")
+    use_s3(request.getfixturevalue("s3_url"), monkeypatch)
+    s3 = fsspec.filesystem("s3")
+    if s3.exists("bucket"):
+        s3.rm("bucket", recursive=True)
+    s3.mkdir("bucket")
+    return Place("s3://bucket/there/d")
 
 
 def use_s3(address: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,15 +107,17 @@ def test_what_is_not_valid_there_comes_as_it_is_and_is_reported(hub: FakeHub, ro
     assert not hub.asked("GET .*/resolve/.*/data/")  # refused before everything was fetched
 
 
-def test_another_pull_of_the_same_folder_is_refused(hub: FakeHub, root: Path, tmp_path: Path) -> None:
-    send(root)
-    (tmp_path / ".e.pull").mkdir()
-    lock = RootLock(tmp_path / ".e.pull")
-    with pytest.raises(DatasetLockedError):
-        pull(HubDataset("me/d"), tmp_path / "e")
-    lock.release()
-    pull(HubDataset("me/d"), tmp_path / "e")
-    assert content(tmp_path / "e") == content(root)
+def test_what_is_in_use_is_neither_pushed_nor_pulled_to(hub: FakeHub, root: Path, tmp_path: Path) -> None:
+    target, other_pull = tmp_path / "e", tmp_path / ".e.pull"
+    other_pull.mkdir()
+    fetch = lambda: pull(HubDataset("me/d"), target)  # noqa: E731
+    for place, move in ((root, lambda: send(root)), (other_pull, fetch), (target, fetch)):
+        lock = RootLock(place)
+        with pytest.raises(DatasetLockedError):
+            move()
+        lock.release()
+        move()
+    assert content(target) == content(root)
 
 
 def break_off(hub: FakeHub, target: Path, path: str) -> None:

@@ -25,8 +25,8 @@ from tests.datasets.support import snapshot as content
 
 
 @pytest.fixture
-def root(few_files: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(few_files, tmp_path / "d"))
+def root(video_episodes: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(video_episodes, tmp_path / "d"))
 
 
 def test_what_is_no_later_version_replaces_nothing(root: Path, near_url: str, tmp_path: Path) -> None:
@@ -194,9 +194,10 @@ async def _no_sleep(*_: object) -> None:
     return None
 
 
-def test_names_are_no_patterns(root: Path, near_url: str) -> None:
+@pytest.mark.parametrize("kind", ["memory", "file"])
+def test_names_are_no_patterns(root: Path, near_url: str, tmp_path: Path, kind: str) -> None:
     """What is removed below one name must not be removed below those that the name would fit as a pattern."""
-    place = near_url.rsplit("/", 2)[0]
+    place = near_url if kind == "memory" else f"file://{tmp_path}"
     plain = f"{place}/runa/d"
     push(root, StoreDataset(plain))
     before = stored(plain)

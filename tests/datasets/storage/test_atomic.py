@@ -31,14 +31,9 @@ from tests.datasets.sweeps.operations import leftovers
 from tests.forks import Fork
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("atomic") / "d", [0, 1, 2])
-
-
 @pytest.fixture
-def root(recorded: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(recorded, tmp_path / "d"))
+def root(three_episodes: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(three_episodes, tmp_path / "d"))
 
 
 def names(root: Path) -> list[str]:

@@ -19,6 +19,8 @@ from bhd_lerobot.datasets.recovery.columns import read_info
 from bhd_lerobot.datasets.recovery.repair import repair
 from bhd_lerobot.datasets.remote.listing import RemoteFile, parse_info
 from bhd_lerobot.datasets.remote.pull import pull
+from bhd_lerobot.datasets.remote.push import push
+from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.places import (
     LINKED_FOLDERS,
@@ -32,21 +34,16 @@ from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import BhdError, DatasetError
 from tests.datasets import support
-from tests.datasets.edit_support import content, record
+from tests.datasets.edit_support import content
 
 ESCAPES = ("../../../../x", "..", ".", "", "/x", "a/b", "a\\b", "a\0b", "a\nb", "\ud800", "x" * 300)
 PARTS = st.sampled_from(["..", ".", "/", "\\", "a", "videos", "\0", "\n", "", "ä", " ", "~", "$HOME", "{", "\ud800"])
 NAMES = st.lists(PARTS, max_size=6).map("".join) | st.text(max_size=8)
 
 
-@pytest.fixture(scope="module")
-def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("places") / "d", [0, 1, 2], video=True)
-
-
 @pytest.fixture
-def root(video_dataset: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(video_dataset, tmp_path / "d"))
+def root(video_episodes: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(video_episodes, tmp_path / "d"))
 
 
 @settings(max_examples=50)
@@ -164,6 +161,7 @@ def test_no_command_follows_a_link_out_of_the_dataset(root: Path, tmp_path: Path
             lambda: load_state(root, videos=False),
             lambda: keep(root, [0], tmp_path / "kept"),
             lambda: repair(root),
+            lambda: push(root, StoreDataset("memory://links/d")),
         ]
         for call in calls:
             with pytest.raises(DatasetError, match=r"is a link to .*secret, outside of the dataset.*cp -rL") as caught:

@@ -48,14 +48,9 @@ COMMANDS: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record(tmp_path_factory.mktemp("whole") / "d", [0, 1, 2], video=True)
-
-
 @pytest.mark.parametrize("is_ours", [True, False])
-def test_no_command_takes_a_pointer_for_damage(whole: Path, tmp_path: Path, is_ours: bool) -> None:
-    root = Path(shutil.copytree(whole, tmp_path / "d"))
+def test_no_command_takes_a_pointer_for_damage(video_episodes: Path, tmp_path: Path, is_ours: bool) -> None:
+    root = Path(shutil.copytree(video_episodes, tmp_path / "d"))
     if not is_ours:
         (root / "meta/bhd.json").unlink()
     for name, (command, needed) in COMMANDS.items():
@@ -94,8 +89,8 @@ def test_no_command_takes_what_was_not_pulled_for_damage(tmp_path: Path, is_ours
 
 
 @each_case(("text", "command"), [(LFS, "git lfs pull"), (ANNEX, "git annex get .")])
-def test_the_message_names_the_files_and_the_command(whole: Path, tmp_path: Path, text: str, command: str) -> None:
-    root = Path(shutil.copytree(whole, tmp_path / "d"))
+def test_the_message_names_the_files_and_the_command(video_episodes, tmp_path, text, command):
+    root = Path(shutil.copytree(video_episodes, tmp_path / "d"))
     for path in (DATA, VIDEO):
         (root / path).write_text(text)
     with pytest.raises(NotFetchedError) as error:

@@ -74,44 +74,28 @@ def test_a_disk_that_fails_at_any_step_of_a_save(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.law
-def test_an_interrupt_at_any_step_of_a_save(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C raises between any two steps; leaving the block must still finalise all that was committed."""
-    step, done = 0, False
-    while not done:
-        root = tmp_path / str(step)
-        with support.create(root) as recorder:
-            support.record(recorder)
-            with stop_at(monkeypatch, step, KeyboardInterrupt()) as seen, contextlib.suppress(KeyboardInterrupt):
-                support.record(recorder)
-            done = len(seen) <= step
-        assert support.read_back(root) in (1, 2)
-        assert not repair(root)
-        step += 1
-    assert support.read_back(root) == 2
-
-
-@pytest.mark.law
+@pytest.mark.parametrize("before", [1, 2], ids=["save", "taking back"])
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "x")], ids=str)
-def test_a_failure_at_any_step_of_taking_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+def test_a_failure_at_any_step_of_a_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: int, error: BaseException
 ) -> None:
     """Leaving the block finalises what the disk says: the last episode is there or not, and nothing is corrupted."""
     step, done = 0, False
     while not done:
         root = tmp_path / str(step)
         with support.create(root) as recorder:
-            for _ in range(2):
+            for _ in range(before):
                 support.record(recorder)
             with (
                 stop_at(monkeypatch, step, error) as seen,
                 contextlib.suppress(KeyboardInterrupt, DatasetWriteError),
             ):
-                recorder.drop_last()
+                support.record(recorder) if before == 1 else recorder.drop_last()
             done = len(seen) <= step
         assert support.read_back(root) in (1, 2)
         assert not repair(root)
         step += 1
-    assert support.read_back(root) == 1
+    assert support.read_back(root) == 3 - before
 
 
 @contextlib.contextmanager
