@@ -41,6 +41,12 @@ SHORTER = {
         "n_episodes=20,": "n_episodes=2,",
         "videos=1,": "videos=0,",
     },
+    "from_the_articles": {
+        "--n_envs=4 --preview_video=false": "--n_envs=4 --preview_video=false --dataset.episode_time_s=10",
+        "--steps=200": "--steps=10",
+        "--n_episodes=2": "--n_episodes=2 --task.duration_s=5",
+        "--seconds=3": "--seconds=1.5",
+    },
     "train_and_evaluate": {
         '"num_episodes": 16}': '"num_episodes": 3, "episode_time_s": 10}',
         "n_envs=16": "n_envs=3",
