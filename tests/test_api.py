@@ -53,43 +53,6 @@ def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
     assert importlib.import_module("bhd_lerobot.errors").BhdError is bhd.BhdError
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory):
-    """Return a dataset that was recorded by keyword arguments, and the result."""
-    folder = tmp_path_factory.mktemp("api")
-    result = bhd.record(
-        robot={"type": "turtlebot3", "beams": 36},
-        brain="gap_follower",
-        task="avoid",
-        dataset={"root": folder / "d", "num_episodes": 2, "episode_time_s": 3},
-        output_dir=folder / "run",
-        preview_video=False,
-    )
-    return folder, result
-
-
-def test_the_workflow(recorded) -> None:
-    folder, result = recorded
-    assert (result.recorded, result.root) == (2, folder / "d")
-    assert bhd.check_dataset(result.root).is_valid
-    assert all(divergence.identical for divergence in bhd.replay(dataset={"root": result.root, "episode": 1}))
-    trained = bhd.train(
-        policy={"type": "bhd_mlp", "push_to_hub": False},
-        dataset={"root": str(result.root)},
-        output_dir=folder / "train",
-        steps=4,
-        batch_size=8,
-    )
-    evaluated = bhd.evaluate(
-        robot={"type": "turtlebot3", "beams": 36},
-        task={"type": "avoid", "duration_s": 2},
-        brains={"rule": "gap_follower", "learned": {"type": "learned", "path": trained.checkpoint}},
-        n_episodes=2,
-        output_dir=folder / "eval",
-    )
-    assert set(evaluated.results.brains) == {"rule", "learned"}
-
-
 @pytest.mark.parametrize(
     ("call", "options", "message"),
     [
@@ -178,3 +141,4 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch) -> None:
     exec(shorter, names)
     exec(second, names)
     assert [row["step"] for row in names["trained"].rows] == [10, 20]
+    assert all(one.identical for one in bhd.replay(dataset={"root": "data/python", "episode": 1}))

@@ -127,7 +127,7 @@ def test_of_one_brain_nothing_is_paired_problems_are_no_markup_and_large_videos_
 ):
     monkeypatch.setattr("bhd_lerobot.evaluation.report.VIDEO_BYTES", 10)
     monkeypatch.setattr("bhd_lerobot.evaluation.run.measure", _with_problem(run.measure))
-    result, _ = run_eval(tmp_path, only="[old]", videos=None, n_episodes=2, task__min_path_m=100)
+    result, _ = run_eval(tmp_path, only="[old]", videos=1, n_episodes=1, task__min_path_m=100)
     text = result.report.read_text()
     assert 'id="summary"' in text
     assert 'id="paired"' not in text

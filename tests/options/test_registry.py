@@ -1,6 +1,5 @@
 """The registry: a name stands for one thing, whoever adds it."""
 
-import collections
 import subprocess
 import sys
 
@@ -9,17 +8,6 @@ import pytest
 from bhd_lerobot.bodies.arenas import ARENAS, register_arena
 from bhd_lerobot.envs.register import ENVIRONMENTS, register_environment
 from bhd_lerobot.errors import ConfigError
-from bhd_lerobot.options.registry import Registry
-
-
-def test_a_name_stands_for_one_thing_and_the_same_again_is_no_other() -> None:
-    registry: Registry = Registry("arena", {"a": len})
-    registry.register("b", max)
-    registry.register("b", max)
-    assert (list(registry), registry["b"]) == (["a", "b"], max)
-    with pytest.raises(ConfigError, match="There is an arena 'b' already, of builtins; that of collections needs"):
-        registry.register("b", collections.Counter)
-    assert registry["b"] is max
 
 
 def test_every_registry_refuses_another_thing_of_a_name() -> None:

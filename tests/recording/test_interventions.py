@@ -117,30 +117,6 @@ def test_the_dataset_is_the_same_for_any_number_of_simulations_and_replays_bit_e
         assert Replay(one, index).open_loop().identical
 
 
-def test_training_finds_the_flagged_frames(tmp_path: Path) -> None:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-    from bhd_lerobot.datasets.loader.selection import frame_weights
-
-    root = tmp_path / "d"
-    run_record(root, **AVOID, brain__patience_s=1, dataset__num_episodes=2)
-    meta = LeRobotDatasetMetadata("test/avoid", root=root)
-    weights = frame_weights(meta, None, intervention=3.0)
-    assert weights is not None
-    # 3 s at 10 Hz: the learner's second, and the expert's two, also the last frame, whose event says how it ended.
-    assert weights.tolist() == ([1.0] * 10 + [3.0] * 20) * 2
-    weights = frame_weights(meta, [1], learner=0.0)
-    assert weights is not None
-    assert weights.tolist() == [0.0] * 10 + [1.0] * 20
-    alone = tmp_path / "alone"
-    run_record(alone, brain__type="gap_follower", dataset__num_episodes=1)
-    merge([alone, root], tmp_path / "both")
-    both = LeRobotDatasetMetadata("test/both", root=tmp_path / "both")
-    weights = frame_weights(both, None, learner=0.5)
-    assert weights is not None
-    assert weights.tolist() == [1.0] * (both.total_frames - 60) + ([0.5] * 10 + [1.0] * 20) * 2
-
-
 def test_a_pick_that_the_learner_does_not_even_begin_succeeds() -> None:
     simulation = make_simulation(UR5Config(action_space="tool", tool_pose=True), 1)
     brain = make_brain(DaggerConfig(NoopConfig(), PickServoConfig(), collision_s=None, stall_s=0.5))

@@ -53,7 +53,7 @@ def test_a_run_leaves_metrics_a_curve_its_configuration_and_checkpoints(data: Pa
 
 
 def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "one", selection__outcome="success", selection__intervention_weight=3.0))
+    run_train(options(data, tmp_path / "one", MLP, selection__outcome="success", selection__intervention_weight=3.0))
     config = tmp_path / "one" / "config.yaml"
     run_train([f"--config_path={config}", f"--output_dir={tmp_path / 'two'}"])
     assert curve(tmp_path / "one") == curve(tmp_path / "two")
@@ -209,7 +209,7 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(data, tmp_pa
 
     monkeypatch.setattr(checkpoint, "_flush", die_the_second_time)
     with pytest.raises(Killed):
-        run_train(options(data, run))
+        run_train(options(data, run, MLP))
     monkeypatch.undo()
     assert os.readlink(run / "checkpoints" / "last") == "000010"
     assert (run / "checkpoints" / ".000020.part").is_dir()
@@ -229,12 +229,12 @@ def test_a_full_disk_ends_with_the_checkpoint_before_intact(data, tmp_path, monk
 
     monkeypatch.setattr(checkpoint, "save_checkpoint", full)
     with pytest.raises(BhdError, match=r"checkpoint of step 20 .* No space left"):
-        run_train(options(data, tmp_path / "run"))
+        run_train(options(data, tmp_path / "run", MLP))
     assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000010", "last"]
 
 
 def test_a_finished_run_names_the_option_to_continue_and_resumes_where_it_was_moved(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "run", steps=5))
+    run_train(options(data, tmp_path / "run", MLP, steps=5))
     with pytest.raises(ConfigError, match=r"5 of 5 steps.*--steps"):
         run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
     (tmp_path / "run").rename(tmp_path / "moved")
@@ -282,23 +282,22 @@ def test_cameras_are_learned_from(tmp_path: Path) -> None:
     assert all(torch.isfinite(torch.tensor(row["loss"])) for row in result.rows)
 
 
-@pytest.mark.parametrize("mode", ["QUANTILES", "QUANTILE10", "MEAN_STD", "MIN_MAX"])
-def test_quantiles_that_are_averages_of_episodes_are_warned_of(tmp_path: Path, mode: str) -> None:
+def test_quantiles_that_are_averages_of_episodes_are_warned_of(tmp_path: Path) -> None:
     """Of episodes that differ, most values lie beyond what the policy takes for nearly all."""
-    mapping = {"STATE": "MEAN_STD", "ENV": "MEAN_STD", "ACTION": mode}
-    policy = {**MLP, "policy.normalization_mapping": json.dumps(mapping)}
-    root = make_dataset(tmp_path / "d", episodes=3, spread=100.0)
-    _, printed = run_train(options(root, tmp_path / "run", policy, steps=1))
-    is_by_quantiles = mode.startswith("QUANTILE")
-    assert ("warning: action is normalised by" in printed) == is_by_quantiles
-    if mode == "QUANTILES":
-        # Around 0, 100 and 200 the average of the quantiles is around 100: at most a third lies between.
-        found = re.search(r"by q01 and q99, and up to (\d+) % of the frames lie beyond them, not 2 %", printed)
-        assert found is not None
-        assert int(found[1]) >= 66
-    root = make_dataset(tmp_path / "one", episodes=1, frames=200)
-    _, printed = run_train(options(root, tmp_path / "other", policy, steps=1))
-    assert "warning: action is normalised by" not in printed
+    differing = make_dataset(tmp_path / "d", episodes=3, spread=100.0)
+    one = make_dataset(tmp_path / "one", episodes=1, frames=200)
+    for mode in ("QUANTILES", "QUANTILE10", "MEAN_STD", "MIN_MAX"):
+        mapping = {"STATE": "MEAN_STD", "ENV": "MEAN_STD", "ACTION": mode}
+        policy = {**MLP, "policy.normalization_mapping": json.dumps(mapping)}
+        _, printed = run_train(options(differing, tmp_path / mode, policy, steps=1))
+        assert ("warning: action is normalised by" in printed) == mode.startswith("QUANTILE")
+        if mode == "QUANTILES":
+            # Around 0, 100 and 200 the average of the quantiles is around 100: at most a third lies between.
+            found = re.search(r"by q01 and q99, and up to (\d+) % of the frames lie beyond them, not 2 %", printed)
+            assert found is not None
+            assert int(found[1]) >= 66
+            _, printed = run_train(options(one, tmp_path / "other", policy, steps=1))
+            assert "warning: action is normalised by" not in printed
 
 
 def test_an_input_that_never_changes_is_warned_of_where_it_would_count(tmp_path: Path) -> None:

@@ -75,9 +75,9 @@ class Robot:
         self.simulation.close()
 
 
-@pytest.fixture(params=[BASE, ARM], ids=["turtlebot3", "ur5"])
+@pytest.fixture
 def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
-    with closing(Robot(request.param)) as made:
+    with closing(Robot(getattr(request, "param", BASE))) as made:
         made.place()
         made.publish()
         yield made
@@ -120,6 +120,7 @@ def watched() -> Iterator[Any]:
 
 
 @pytest.mark.law
+@pytest.mark.parametrize("robot", [BASE, ARM], ids=["turtlebot3", "ur5"], indirect=True)
 def test_the_page_is_sent_where_the_robot_is_and_what_is_around_it(robot: Robot, watched: Any) -> None:
     with served(watched(robot), 0) as address, closing(Stream(address)) as stream:
         assert stream.answer.getheader("Content-Type") == "text/event-stream"

@@ -371,16 +371,16 @@ def test_a_phone(browser, base) -> None:
 
 
 def test_an_address_that_names_no_episode_says_so(browser, base) -> None:
-    for place, message in (
-        ("#episode=7", "There is no episode 7: the dataset has 3, from 0 to 2."),
-        ("#episode=0&compare=9", "There is no episode 9"),
-        ("#episode=last", "The address names episode last, which is no number"),
-    ):
-        with served(base) as server, opened(browser, server.url, place) as page:
-            assert message in page.text_content("#toast")
-            assert page.get_attribute(".card-a", "data-episode") == "0"
-    with served(base) as server, opened(browser, server.url) as page:  # an address that is changed by hand
-        page.evaluate("location.hash = '#episode=2'")
+    with served(base) as server, opened(browser, server.url, "#episode=7") as page:
+        assert "There is no episode 7: the dataset has 3, from 0 to 2." in page.text_content("#toast")
+        assert page.get_attribute(".card-a", "data-episode") == "0"
+        for place, message in (  # an address that is changed by hand
+            ("episode=0&compare=9", "There is no episode 9"),
+            ("episode=last", "The address names episode last, which is no number"),
+        ):
+            page.evaluate(f"location.hash = '{place}'")
+            page.wait_for_selector(f"#toast:has-text('{message}')")
+        page.evaluate("location.hash = 'episode=2'")
         page.wait_for_selector(".card-a[data-episode='2']")
 
 

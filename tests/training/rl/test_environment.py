@@ -15,27 +15,15 @@ from bhd_lerobot.training.rl.config import RewardConfig, RlConfig, parse_rl
 from bhd_lerobot.training.rl.environment import FeatureStack, RlVecEnv, Shaping, pose_potential
 from bhd_lerobot.training.rl.learner import make_learner
 from bhd_lerobot.training.rl.parts import RlParts, make_parts
+from tests.training.rl.test_train import options as run_options
 
 N = 3
 
 
 def options(duration_s: int = 1) -> list[str]:
-    return [
-        "--algorithm=ppo",
-        "--robot.type=turtlebot3",
-        "--robot.beams=36",
-        "--task.type=avoid",
-        f"--task.duration_s={duration_s}",
-        "--task.min_path_m=0",
-        f"--env.n_envs={N}",
-        "--env.threads=1",
-        "--policy.n_obs_steps=3",
-        "--policy.obs_stride=2",
-        "--policy.hidden_dims=[8]",
-        "--policy.critic_dims=[8]",
-        "--ppo.n_steps=12",
-        "--ppo.batch_size=12",
-    ]
+    episodes = {"task__duration_s": duration_s, "task__min_path_m": 0, "env__n_envs": N}
+    policy = {"policy__n_obs_steps": 3, "policy__hidden_dims": [8], "policy__scan__transform": None}
+    return run_options(**episodes, **policy, ppo__n_steps=12, ppo__batch_size=12)
 
 
 def environment(config: RlConfig) -> BhdVectorEnv:
