@@ -40,6 +40,7 @@ def test_a_double_with_other_servos_is_found_within_ten_percent() -> None:
         assert one.error_rad < 0.001
 
 
+@pytest.mark.thorough
 def test_an_arm_on_its_bus_is_found_within_ten_percent(bus: Bus) -> None:
     bus.change(servo={"stiffness": 14.0, "damping": 0.75, "friction": 0.035})
     robot = SO101(for_identification(bus.config(id="identified")))

@@ -112,6 +112,9 @@ def test_delete_leaves_the_others(six_episodes: Path, tmp_path: Path) -> None:
         assert content(root) == left
         assert_valid(root)
         assert not (root / layout.STAGING).exists()
+    with pytest.raises(DatasetError, match="No episode is left"):
+        delete(root, range(len(left)))
+    assert content(root) == left
 
 
 def test_data_are_those_of_lerobots_own_merge(six_episodes: Path, tmp_path: Path) -> None:
@@ -200,22 +203,17 @@ def test_recordings_in_other_units_do_not_merge(six_episodes: Path, tmp_path: Pa
     assert_valid(tmp_path / "all")
 
 
-def test_metadata_of_some_episodes_is_empty_in_the_others(six_episodes: Path, tmp_path: Path) -> None:
-    recorder = support.create(tmp_path / "other")
-    recorder.save(support.fill(recorder.begin_episode(), 1), task="t", metadata={"outcome": "stuck", "extra": 3})
-    recorder.finalize()
+def test_metadata_of_some_episodes_is_empty_in_the_others_and_of_another_type_does_not_merge(six_episodes, tmp_path):
+    for name, metadata in (("other", {"outcome": "stuck", "extra": 3}), ("odd", {"outcome": 3})):
+        recorder = support.create(tmp_path / name)
+        recorder.save(support.fill(recorder.begin_episode(), 1), task="t", metadata=metadata)
+        recorder.finalize()
     merge([six_episodes, tmp_path / "other"], tmp_path / "all")
     episodes = dataset_info(tmp_path / "all").episodes
     assert episodes[0].metadata == support.metadata(0)
     assert episodes[-1].metadata == {"outcome": "stuck", "extra": 3}
-
-
-def test_metadata_of_another_type_does_not_merge(six_episodes: Path, tmp_path: Path) -> None:
-    recorder = support.create(tmp_path / "other")
-    recorder.save(support.fill(recorder.begin_episode(), 1), task="t", metadata={"outcome": 3})
-    recorder.finalize()
     with pytest.raises(DatasetMismatchError, match="bhd/outcome"):
-        merge([six_episodes, tmp_path / "other"], tmp_path / "all")
+        merge([six_episodes, tmp_path / "odd"], tmp_path / "none")
 
 
 def test_several_read_a_dataset_at_once_and_nobody_writes_it_meanwhile(six_episodes: Path, tmp_path: Path) -> None:

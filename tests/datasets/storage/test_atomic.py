@@ -443,17 +443,6 @@ def test_signals_are_deferred(root: Path, monkeypatch: pytest.MonkeyPatch, numbe
     assert seen == [2]
 
 
-def test_what_came_into_force_is_noted_when_it_did(tmp_path: Path) -> None:
-    with atomic.noting_what_is_done() as done:
-        with atomic.building(tmp_path / "new", Disk(), lambda: None) as space:
-            space.lock_new()
-            (space.folder / "a").write_text("1")
-            atomic.note_done("a change in the workspace")
-            assert done == []
-        assert done == [f"{tmp_path / 'new'} had been made"]
-    assert (tmp_path / "new" / "a").read_text() == "1"
-
-
 def test_an_error_with_ctrl_c_reports_a_decided_change(root: Path, monkeypatch, capsys) -> None:
     def refuse(*_: object) -> None:
         signal.raise_signal(signal.SIGINT)

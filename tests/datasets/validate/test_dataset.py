@@ -3,6 +3,7 @@
 import re
 import shutil
 from collections.abc import Callable
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -110,57 +111,32 @@ def test_a_dataset_of_stock_lerobot_is_valid(tmp_path: Path) -> None:
     assert [finding for finding in check_dataset(root).findings if finding.severity == Severity.ERROR] == []
 
 
-def nan(rows: dict[str, Any]) -> None:
-    rows["observation.state"][length(0) + 4][1] = float("nan")
-    rows["observation.state"][length(0) + 9][1] = float("inf")
+OBS = "observation.state"
+START = length(0)  # of the second episode
+SECOND = range(START, START + length(1))
 
 
-def age(rows: dict[str, Any]) -> None:
-    rows["control.age"][3] = float("nan")
+def put(key: str, values: dict[int, Any], number: int | None = None) -> Callable[[dict[str, Any]], None]:
+    """Put values into rows of a column, or into one number of these rows."""
 
+    def change(rows: dict[str, Any]) -> None:
+        for row, value in values.items():
+            if number is None:
+                rows[key][row] = value
+            else:
+                rows[key][row][number] = value
 
-def frozen_sensor(rows: dict[str, Any]) -> None:
-    for row in range(length(0), length(0) + length(1)):
-        rows["observation.state"][row][0] = 0.25
+    return change
 
 
 def frozen_episode(rows: dict[str, Any]) -> None:
-    for row in range(length(0), length(0) + length(1)):
-        rows["observation.state"][row] = rows["observation.state"][length(0)]
+    for row in SECOND:
+        rows["observation.state"][row] = rows["observation.state"][START]
 
 
 def flipped(rows: dict[str, Any]) -> None:
-    for row in range(length(0) + 7, length(0) + 12):
+    for row in SECOND[7:12]:
         rows["observation.state"][row][2:] = [-x for x in rows["observation.state"][row][2:]]
-
-
-def jump(rows: dict[str, Any]) -> None:
-    rows["action"][length(0) + 6][0] = -1.9
-
-
-def beyond(rows: dict[str, Any]) -> None:
-    rows["observation.state"][5][0] = 2.5
-
-
-def late(rows: dict[str, Any]) -> None:
-    for row in range(10):
-        rows["control.late"][row] = True
-
-
-def shifted(rows: dict[str, Any]) -> None:
-    rows["timestamp"][length(0) + 3] += 0.01
-
-
-def swapped(rows: dict[str, Any]) -> None:
-    rows["frame_index"][2], rows["frame_index"][3] = 3, 2
-
-
-def no_task(rows: dict[str, Any]) -> None:
-    rows["task_index"][8] = 2
-
-
-def no_column(rows: dict[str, Any]) -> None:
-    del rows["control.age"]
 
 
 def lost_row(rows: dict[str, Any]) -> None:
@@ -168,23 +144,45 @@ def lost_row(rows: dict[str, Any]) -> None:
         values.pop()
 
 
+JUMP = put("action", {START + 6: -1.9}, 0)
+
+
 ERROR, WARNING = Severity.ERROR, Severity.WARNING
 
 
+# The damage; what is found: how severe, by which check, where and what.
 DAMAGED_NUMBERS = (
-    (nan, (ERROR, "finite", "observation.state", "2 frames .* first in episode 1, frame 4: b.pos is nan")),
-    (frozen_sensor, (WARNING, "frozen", "observation.state: a.pos", "does not change in episode 1,")),
-    (frozen_episode, (WARNING, "frozen", "observation.state", "nothing changes in episode 1")),
-    (flipped, (WARNING, "jumps", "observation.state: tool", "2 times in 1 episodes, first in episode 1, frame 7")),
-    (jump, (WARNING, "jumps", "action: a.pos", "2 times in 1 episodes, first in episode 1, frame 6")),
-    (beyond, (WARNING, "limits", "observation.state: a.pos", "to 2.5; the robot's limits are -2 and 2")),
-    (late, (WARNING, "timing", "control.late", "10 of 135 frames were late")),
-    (shifted, (ERROR, "timing", "file-000", "1 timestamps .* the first in episode 1, frame 3: 0.31 s")),
-    (swapped, (ERROR, "counts", "file-000", "frame_index is 3 in row 2, where meta/episodes has 2")),
-    (no_task, (ERROR, "counts", "file-000", "task_index is 2; there are 2 instructions")),
-    (no_column, (ERROR, "schema", "file-000", "no column control.age")),
-    (lost_row, (ERROR, "counts", "file-000", "134 frames; its episodes have 135")),
-    (age, (Severity.NOTE, "finite", "control.age", "episode 0, frame 3")),  # no policy learns from it
+    (
+        put(OBS, {START + 4: nan, START + 9: inf}, 1),
+        ERROR,
+        "finite",
+        OBS,
+        "2 frames .* first in episode 1, frame 4: b.pos",
+    ),
+    (put(OBS, dict.fromkeys(SECOND, 0.25), 0), WARNING, "frozen", f"{OBS}: a.pos", "does not change in episode 1,"),
+    (frozen_episode, WARNING, "frozen", OBS, "nothing changes in episode 1"),
+    (flipped, WARNING, "jumps", f"{OBS}: tool", "2 times in 1 episodes, first in episode 1, frame 7"),
+    (JUMP, WARNING, "jumps", "action: a.pos", "2 times in 1 episodes, first in episode 1, frame 6"),
+    (put(OBS, {5: 2.5}, 0), WARNING, "limits", f"{OBS}: a.pos", "to 2.5; the robot's limits are -2 and 2"),
+    (
+        put("control.late", dict.fromkeys(range(10), True)),
+        WARNING,
+        "timing",
+        "control.late",
+        "10 of 135 frames were late",
+    ),
+    (put("timestamp", {START + 3: 0.31}), ERROR, "timing", "file-000", "1 timestamps .* in episode 1, frame 3: 0.31 s"),
+    (put("frame_index", {2: 3, 3: 2}), ERROR, "counts", "file-000", "is 3 in row 2, where meta/episodes has 2"),
+    (put("task_index", {8: 2}), ERROR, "counts", "file-000", "task_index is 2; there are 2 instructions"),
+    (lambda rows: rows.pop("control.age"), ERROR, "schema", "file-000", "no column control.age"),
+    (lost_row, ERROR, "counts", "file-000", "134 frames; its episodes have 135"),
+    (
+        put("control.age", {3: nan}),
+        Severity.NOTE,
+        "finite",
+        "control.age",
+        "episode 0, frame 3",
+    ),  # nobody learns from it
 )
 
 
@@ -192,7 +190,7 @@ DAMAGED_NUMBERS = (
 def test_damaged_numbers_are_found(valid: Path, tmp_path: Path) -> None:
     root = copy(valid, tmp_path)
     origin = data_file(root).read_bytes()
-    for damage, (severity, check, where, what) in DAMAGED_NUMBERS:
+    for damage, severity, check, where, what in DAMAGED_NUMBERS:
         data_file(root).write_bytes(origin)
         edit(data_file(root), damage)
         found = check_dataset(root, limits)
@@ -207,12 +205,7 @@ def test_a_number_that_rests_at_an_end_of_its_range_is_no_broken_sensor(valid: P
     """It may be clipped there."""
     root = copy(valid, tmp_path)
     for value in (-2.0, 2.0):
-
-        def rest(rows: dict[str, Any], value: float = value) -> None:
-            for row in range(length(0), length(0) + length(1)):
-                rows["observation.state"][row][0] = value
-
-        edit(data_file(root), rest)
+        edit(data_file(root), put("observation.state", dict.fromkeys(SECOND, value), 0))
         assert not [one for one in bad(check_dataset(root)) if one.check == "frozen"]
 
 
@@ -220,7 +213,7 @@ def test_a_column_with_gaps_is_found_and_the_rest_is_checked(valid: Path, tmp_pa
     def gap(rows: dict[str, Any]) -> None:
         rows["observation.state"][3] = None
         frozen_episode({"observation.state": rows["observation.state"]})
-        jump(rows)
+        JUMP(rows)
 
     root = copy(valid, tmp_path)
     edit(data_file(root), gap)
