@@ -100,7 +100,6 @@ def main() -> int:
     """Print the table; return 3 if an arm touches something in spite of the check, or presses for over 0.5 s."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speeds", type=float, nargs="+", default=list(SPEEDS), help="of the joints [rad/s]")
-    parser.add_argument("--strikes", type=float, nargs="+", default=list(STRIKES), help="of the links [m/s]")
     parser.add_argument("--frames", type=int, default=900, help="of each run, at the most")
     arguments = parser.parse_args()
     table = Table(title="A UR5 that runs into something: peak force, and time above 20 N")
@@ -118,11 +117,11 @@ def main() -> int:
                 missed |= way != WAYS[2] and outcome.over_s > WITHIN_S
             table.add_row(into, f"{speed} rad/s", *row)
     links = Table(title="A link that meets a pillar, with the limit of force: peak force, and time above 20 N")
-    for column in ("link", "lever", *(f"{strike} m/s" for strike in arguments.strikes)):
+    for column in ("link", "lever", *(f"{strike} m/s" for strike in STRIKES)):
         links.add_column(column)
     for link, (turn, lever, (x, y, height)) in PILLARS.items():
         pillar, row = Shape("cylinder", x, y, 0.0, 0.03, 0.03, height), []
-        for strike in arguments.strikes:
+        for strike in STRIKES:
             outcome = run(turn, (pillar,), strike / lever, min(arguments.frames, round(25 * lever / strike) + 60))
             row.append(f"{outcome.peak:.0f} N, {outcome.over_s:.2f} s, {outcome.ended}")
             missed |= outcome.over_s == np.inf  # slow ones press for long before they press hard

@@ -152,13 +152,13 @@ def add_false_contacts(report: Report, faults: Sequence[tuple[int, float]]) -> N
         report.add(what, f"{felt:.2f} N")
 
 
-def add_cost(report: Report, counts: Sequence[int], rounds: int) -> None:
+def add_cost(report: Report, counts: Sequence[int]) -> None:
     """Add rows of the time of a tick of some numbers of arms."""
     for n in counts:
         rig = Rig(n=n)
         rig.keep(0.2)
         times = []
-        for _ in range(rounds):
+        for _ in range(5):
             times.append((seconds(partial(rig.keep, 1.0)) - seconds(partial(rig.world.step, 500))) / 500)
         report.add(f"a tick of {n} arms, physics not counted", f"{np.median(times) * 1e3:.2f} ms")
 
@@ -170,7 +170,7 @@ def main() -> int:
     add_pushes(report, SPEEDS[-1:] if options.quick else SPEEDS)
     add_stop(report)
     add_false_contacts(report, FAULTS[-1:] if options.quick else FAULTS)
-    add_cost(report, *(((1,), 1) if options.quick else ((1, 8), 5)))
+    add_cost(report, (1,) if options.quick else (1, 8))
     return report.end(options.json)
 
 

@@ -19,7 +19,7 @@ SHORT = {
     "brains": "--episodes=2 --episode_s=1",
     "check": "--episodes=2 --frames=10 --turns=1",
     "cluster": "--episodes=2 --episode_s=1 --turns=1",
-    "contact": "--speeds=3 --strikes=0.25 --frames=5",
+    "contact": "--speeds=3 --frames=5",
     "envs": "--n=1 --repeats=1 --seconds=0.1 --peers sync",
     "impedance": "--quick",
     "kinematics": "--poses=2",
