@@ -47,6 +47,14 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a policy can learn: six episodes in which the action follows from what is observed."""
+    from tests.training.support import make_dataset
+
+    return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
+
+
+@pytest.fixture(scope="session")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A base with a camera: three episodes of 20 frames."""
     from tests.recording.support import run_record

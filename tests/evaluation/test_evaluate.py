@@ -27,7 +27,7 @@ from bhd_lerobot.policies.navigation.gap_follower import GapFollowerBrain
 from bhd_lerobot.rollout import provenance
 from bhd_lerobot.tasks.task import episode_seed
 from tests.forks import Fork
-from tests.recording.support import data_columns, episode_rows, run_record
+from tests.recording.support import command_line, data_columns, episode_rows, run_record
 
 
 def options(folder, **overrides) -> list[str]:
@@ -43,9 +43,8 @@ def options(folder, **overrides) -> list[str]:
         "n_envs": 3,
         "videos": 0,
         "output_dir": folder,
-        **{key.replace("__", "."): value for key, value in overrides.items()},
     }
-    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+    return command_line(values, overrides)
 
 
 def run_eval(folder, **overrides) -> tuple[EvalResult, str]:

@@ -12,13 +12,14 @@ from bhd_lerobot.cli.evaluate import main
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.evaluation.operator import drawn_orders
 from tests.forks import Fork, Terminal
+from tests.recording.support import command_line
 
 LABELS = ("quixote", "zeppelin")
 CAMERAS = "{front: {type: mock_camera}}"
 
 
 def options(folder: Path, **overrides: object) -> list[str]:
-    values: dict[str, object] = {
+    values = {
         "robot.discover_packages_path": "tests.robots.external.mock_devices",
         "robot.type": "mock_arm",
         "robot.calibration_dir": folder / "calibration",
@@ -32,9 +33,8 @@ def options(folder: Path, **overrides: object) -> list[str]:
         "n_episodes": 3,
         "seed": 5,
         "output_dir": folder / "e",
-        **{key.replace("__", "."): value for key, value in overrides.items()},
     }
-    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+    return command_line(values, overrides)
 
 
 class Judged(Terminal):

@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,15 @@ from tests.forks import Fork
 from tests.waiting import until
 
 
+def command_line(values: Mapping[str, object], overrides: Mapping[str, object]) -> list[str]:
+    """Return a command line; overrides are written with `__` for dots, and None leaves an option out."""
+    values = {**values, **{key.replace("__", "."): value for key, value in overrides.items()}}
+    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+
+
 def options(root: Path, **overrides: object) -> list[str]:
-    """Return a short recording's command line; overrides are written with `__` for dots, None leaves an option out."""
-    values: dict[str, object] = {
+    """Return a short recording's command line."""
+    values = {
         "robot.type": "turtlebot3",
         "brain.type": "avoidance",
         "task.type": "avoid",
@@ -36,9 +43,8 @@ def options(root: Path, **overrides: object) -> list[str]:
         "dataset.num_episodes": 3,
         "dataset.episode_time_s": 3,
         "robot.beams": 36,
-        **{key.replace("__", "."): value for key, value in overrides.items()},
     }
-    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+    return command_line(values, overrides)
 
 
 def run_record(root: Path, **overrides: object) -> tuple[RecordResult, str]:

@@ -14,6 +14,7 @@ from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.training.arguments import parse_train
 from bhd_lerobot.training.log import TIMING
 from bhd_lerobot.training.train import TrainResult, train
+from tests.recording.support import command_line
 
 FPS = 10
 NAMES = ["a.pos", "b.pos", "c.pos", "a.vel"]
@@ -104,8 +105,8 @@ MLP = {"policy.type": "bhd_mlp", "policy.hidden_dims": [16, 16], "policy.chunk_s
 
 
 def options(root: Path, run: Path | None, policy: dict[str, Any] | None = None, **overrides: Any) -> list[str]:
-    """Return a short training's command line; overrides are written with `__` for dots, None leaves an option out."""
-    values: dict[str, Any] = {
+    """Return a short training's command line."""
+    values = {
         "dataset.repo_id": "t/t",
         "dataset.root": root,
         "output_dir": run,
@@ -118,9 +119,8 @@ def options(root: Path, run: Path | None, policy: dict[str, Any] | None = None, 
         "threads": 1,
         "env_eval_freq": 0,
         **(ACT if policy is None else policy),
-        **{key.replace("__", "."): value for key, value in overrides.items()},
     }
-    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+    return command_line(values, overrides)
 
 
 def run_train(arguments: list[str]) -> tuple[TrainResult, str]:

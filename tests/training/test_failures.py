@@ -29,14 +29,9 @@ from tests.training.support import ACT, MLP, curve, make_dataset, options, poiso
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("data") / "set")
-
-
-@pytest.fixture(scope="module")
-def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(lesson: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "trained"
-    run_train(options(data, run, MLP, steps=10))
+    run_train(options(lesson, run, MLP, steps=10))
     return run
 
 
@@ -70,7 +65,7 @@ def test_a_dataset_that_lacks_what_is_needed(trained: Path, tmp_path: Path) -> N
     refused(options(root, tmp_path / "run"), DatasetError, "no episode")
 
 
-def test_a_selection_that_leaves_nothing_to_learn_from(data: Path, tmp_path: Path) -> None:
+def test_a_selection_that_leaves_nothing_to_learn_from(lesson: Path, tmp_path: Path) -> None:
     for change, error, match in (
         ({"selection__outcome": "dropped"}, DatasetError, r"dropped.*4 success"),
         ({"selection__outcome": "[]"}, ConfigError, "No outcome is given"),
@@ -79,7 +74,7 @@ def test_a_selection_that_leaves_nothing_to_learn_from(data: Path, tmp_path: Pat
         ({"dataset__episodes": "[0, 17]"}, DatasetError, "no episode 17.*0 to 5"),
     ):
         arguments: dict[str, Any] = change
-        refused(options(data, tmp_path / "run", **arguments), error, match)
+        refused(options(lesson, tmp_path / "run", **arguments), error, match)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -92,7 +87,7 @@ def test_a_value_that_is_not_finite_is_named(tmp_path: Path, value: float) -> No
     assert result.step == 2
 
 
-def test_fine_tuning_on_what_does_not_fit_is_refused(data: Path, trained: Path, tmp_path: Path) -> None:
+def test_fine_tuning_on_what_does_not_fit_is_refused(lesson: Path, trained: Path, tmp_path: Path) -> None:
     for number, (change, match) in enumerate(
         (
             ({"robot": "other"}, r"robot 'toy'.*'other'"),
@@ -107,11 +102,11 @@ def test_fine_tuning_on_what_does_not_fit_is_refused(data: Path, trained: Path, 
     file = other / "checkpoints" / "last" / "pretrained_model" / "bhd.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "units": "degrees"}))
     match = r"values are in SI.*trained on values in degrees"
-    refused(options(data, tmp_path / "run", {}, fine_tune=other), DatasetMismatchError, match)
+    refused(options(lesson, tmp_path / "run", {}, fine_tune=other), DatasetMismatchError, match)
 
 
-def test_a_camera_that_a_policy_does_not_look_through_need_not_be_the_same(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "first", MLP, steps=1))
+def test_a_camera_that_a_policy_does_not_look_through_need_not_be_the_same(lesson: Path, tmp_path: Path) -> None:
+    run_train(options(lesson, tmp_path / "first", MLP, steps=1))
     contract = tmp_path / "first" / "checkpoints" / "last" / "pretrained_model" / "bhd.json"
     contract.write_text(json.dumps({**json.loads(contract.read_text()), "cameras": {"front": [8, 8, 3]}}))
     root = make_dataset(tmp_path / "set", episodes=2, frames=4, camera=True)
@@ -119,13 +114,13 @@ def test_a_camera_that_a_policy_does_not_look_through_need_not_be_the_same(data:
     assert result.step == 1
 
 
-def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(data, tmp_path):
+def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_statistics(lesson, tmp_path):
     """What it says nothing about stays as it is observed: by `bhd-train` in all ways.
 
     LeRobot's programs do not tell the policy which statistics count: it learns where they are the same only.
     """
     first = tmp_path / "first"
-    run_train(options(data, first, {**MLP, "policy.residual": "['*.pos']"}, steps=1))
+    run_train(options(lesson, first, {**MLP, "policy.residual": "['*.pos']"}, steps=1))
     other = make_dataset(tmp_path / "set", episodes=3, shift=5.0)
     folders = [first / "checkpoints" / "last" / "pretrained_model"]
     for statistics in ("checkpoint", "dataset"):
@@ -141,7 +136,7 @@ def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_s
     config = PreTrainedConfig.from_pretrained(folders[0])
     config.pretrained_path = folders[0]
     before, after = make_pre_post_processors(config, pretrained_path=str(folders[0]))
-    made.append((make_policy(config, LeRobotDatasetMetadata("t/t", root=data)).train(), before, after))
+    made.append((make_policy(config, LeRobotDatasetMetadata("t/t", root=lesson)).train(), before, after))
     unlike = make_policy(config, LeRobotDatasetMetadata("t/t", root=other))
     with pytest.raises(ConfigError, match=r"this dataset has others. Fine-tune it by bhd-train"):
         unlike.train()
@@ -156,9 +151,11 @@ def test_a_policy_whose_actions_begin_where_the_robot_is_does_so_with_whatever_s
         assert torch.allclose(actions, state[:, None, :2].expand_as(actions), atol=1e-5)
 
 
-def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, trained: Path, tmp_path: Path) -> None:
+def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(
+    lesson: Path, trained: Path, tmp_path: Path
+) -> None:
     changes = {"steps": 4, "save_freq": 2, "log_freq": 1, "fine_tune_parameters": "['*.bias']"}
-    result, _ = run_train(options(data, tmp_path / "run", {}, fine_tune=trained, **changes))
+    result, _ = run_train(options(lesson, tmp_path / "run", {}, fine_tune=trained, **changes))
     assert result.checkpoint is not None
     folders = (trained / "checkpoints" / "last", result.checkpoint)
     old, new = (load_file(folder / "pretrained_model" / "model.safetensors") for folder in folders)
@@ -175,15 +172,15 @@ def test_fine_tuning_changes_only_the_parameters_that_are_asked_for(data: Path, 
     assert all(torch.equal(values, again_new[name]) for name, values in new.items())
 
 
-def test_a_camera_is_found_only_for_a_policy_that_has_one(data: Path, trained: Path, tmp_path: Path) -> None:
-    arguments = options(data, tmp_path / "run", {}, fine_tune=trained, fine_tune_camera="true")
+def test_a_camera_is_found_only_for_a_policy_that_has_one(lesson: Path, trained: Path, tmp_path: Path) -> None:
+    arguments = options(lesson, tmp_path / "run", {}, fine_tune=trained, fine_tune_camera="true")
     refused(arguments, ConfigError, r"'bhd_mlp' does not know where its camera stands; a 'bhd_perception' does")
-    arguments = options(data, tmp_path / "run", MLP, fine_tune_camera="true")
+    arguments = options(lesson, tmp_path / "run", MLP, fine_tune_camera="true")
     refused(arguments, ConfigError, r"no checkpoint is given; set --fine_tune")
 
 
-def test_a_checkpoint_that_is_not_there(data: Path, tmp_path: Path) -> None:
-    arguments = options(data, tmp_path / "run", {}, fine_tune=tmp_path / "none")
+def test_a_checkpoint_that_is_not_there(lesson: Path, tmp_path: Path) -> None:
+    arguments = options(lesson, tmp_path / "run", {}, fine_tune=tmp_path / "none")
     refused(arguments, ConfigError, r"no policy at .*none.*does not exist")
     with pytest.raises(ConfigError, match="No checkpoint to resume at"):
         parse_train(["--resume=true", f"--config_path={tmp_path / 'none'}"])
@@ -202,12 +199,12 @@ def test_a_checkpoint_with_a_damaged_state_or_another_dataset_is_not_resumed(tra
         run_train(again)
 
 
-def test_weights_that_are_damaged_are_named(data: Path, trained: Path, tmp_path: Path) -> None:
+def test_weights_that_are_damaged_are_named(lesson: Path, trained: Path, tmp_path: Path) -> None:
     shutil.copytree(trained, tmp_path / "damaged", symlinks=True)
     file = tmp_path / "damaged" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
     file.write_bytes(file.read_bytes()[:200])
     for key in ("fine_tune", "policy.path"):
-        arguments = options(data, tmp_path / "run", {key: tmp_path / "damaged"})
+        arguments = options(lesson, tmp_path / "run", {key: tmp_path / "damaged"})
         refused(arguments, ConfigError, r"'bhd_mlp' cannot be made from .*damaged.*header")
     with pytest.raises(ConfigError, match=r"'bhd_mlp' cannot be made from .*damaged"):
         run_train(["--resume=true", f"--config_path={tmp_path / 'damaged'}", "--steps=12"])
@@ -221,8 +218,8 @@ def test_an_environment_of_another_robot(tmp_path: Path) -> None:
         refused(options(root, tmp_path / "run", MLP, **env), ConfigError, message)
 
 
-def test_what_a_resumed_run_would_ignore_is_refused(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "run", MLP, steps=5))
+def test_what_a_resumed_run_would_ignore_is_refused(lesson: Path, tmp_path: Path) -> None:
+    run_train(options(lesson, tmp_path / "run", MLP, steps=5))
     resume = ["--resume=true", f"--config_path={tmp_path / 'run'}", "--steps=7"]
     for name, value, was in (
         ("policy.optimizer_lr", 0.5, 0.001),
@@ -253,7 +250,7 @@ def test_what_is_chosen_by_while_training_is_not_what_is_reported(tmp_path, monk
     assert splits == ["validation", "train", "validation"]
 
 
-def test_metrics_that_cannot_be_written_leave_the_checkpoint(data, tmp_path, monkeypatch):
+def test_metrics_that_cannot_be_written_leave_the_checkpoint(lesson, tmp_path, monkeypatch):
     append = MetricsFile.append
 
     def full(self: MetricsFile, row: dict[str, Any]) -> None:
@@ -267,7 +264,7 @@ def test_metrics_that_cannot_be_written_leave_the_checkpoint(data, tmp_path, mon
     monkeypatch.setattr(MetricsFile, "append", full)
     monkeypatch.setattr(output, "draw_loss", no_image)
     with pytest.raises(BhdError, match=r"metrics of step 15 .*No space left.*000010 is intact.*resume"):
-        run_train(options(data, tmp_path / "run", MLP))
+        run_train(options(lesson, tmp_path / "run", MLP))
     monkeypatch.undo()
     result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
     assert (result.step, [row["step"] for row in curve(tmp_path / "run")]) == (20, [5, 10, 15, 20])
@@ -295,7 +292,7 @@ def test_what_is_held_out_stays_so_when_a_run_is_resumed(tmp_path: Path) -> None
     ("what", "said"),
     [("loss", r"loss is nan at step 10 .*batch of episode:frame \d+:\d+"), ("gradient", "gradient is nan at step 10 ")],
 )
-def test_what_is_not_a_number_stops_before_it_reaches_weights_that_are_saved(data, tmp_path, monkeypatch, what, said):
+def test_what_is_not_a_number_stops_before_it_reaches_weights_that_are_saved(lesson, tmp_path, monkeypatch, what, said):
     calls = []
     forward = MlpPolicy.forward
 
@@ -308,22 +305,22 @@ def test_what_is_not_a_number_stops_before_it_reaches_weights_that_are_saved(dat
 
     monkeypatch.setattr(MlpPolicy, "forward", breaks)
     with pytest.raises(BhdError, match=rf"{said}.*step 5 is kept"):
-        run_train(options(data, tmp_path / "run", MLP, steps=10, save_freq=5))
+        run_train(options(lesson, tmp_path / "run", MLP, steps=10, save_freq=5))
     monkeypatch.undo()
     assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000005", "last"]
     result, _ = run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
     assert result.step == 10
 
 
-def test_an_output_folder_that_exists(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_output_folder_that_exists(lesson: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "precious").touch()
-    refused(options(data, tmp_path / "run"), ConfigError, r"run exists and holds no run to continue.*--output_dir\.")
+    refused(options(lesson, tmp_path / "run"), ConfigError, r"run exists and holds no run to continue.*--output_dir\.")
     assert [one.name for one in (tmp_path / "run").iterdir()] == ["precious"]
     with pytest.raises(ConfigError, match=r"File name too long.*--output_dir"):
-        run_train(options(data, tmp_path / ("x" * 300)))
+        run_train(options(lesson, tmp_path / ("x" * 300)))
     monkeypatch.setenv("HOME", str(tmp_path))
-    refused(options(data, Path("~/run")), ConfigError, rf"The output folder {tmp_path / 'run'} exists")
+    refused(options(lesson, Path("~/run")), ConfigError, rf"The output folder {tmp_path / 'run'} exists")
 
 
 @each_case(
@@ -358,14 +355,14 @@ def test_an_output_folder_that_exists(data: Path, tmp_path: Path, monkeypatch: p
         ({"policy.optimizer_lr": ".nan"}, r"optimizer cannot be made: .*nan.*policy\.optimizer_"),
     ],
 )
-def test_a_configuration_that_cannot_be_honoured(data, tmp_path, change, match):
-    refused(options(data, tmp_path / "run", {**ACT, **change}), ConfigError, match)
-    arguments = [one for one in options(data, tmp_path / "run", {}) if "policy" not in one]
+def test_a_configuration_that_cannot_be_honoured(lesson, tmp_path, change, match):
+    refused(options(lesson, tmp_path / "run", {**ACT, **change}), ConfigError, match)
+    arguments = [one for one in options(lesson, tmp_path / "run", {}) if "policy" not in one]
     refused(arguments, ConfigError, "No policy is given.*bhd_mlp")
 
 
-def test_mixed_precision_that_the_processor_can_only_emulate(data, tmp_path, monkeypatch):
-    arguments = options(data, tmp_path / "run", MLP, steps=2, policy__use_amp="true")
+def test_mixed_precision_that_the_processor_can_only_emulate(lesson, tmp_path, monkeypatch):
+    arguments = options(lesson, tmp_path / "run", MLP, steps=2, policy__use_amp="true")
     # A processor that has no such instruction says so, or knows nothing of it.
     for known in ({}, {"avx512_bf16": False, "avx2": True}, {"neon": True}):
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda known=known: known)
@@ -406,7 +403,7 @@ def test_a_run_goes_on_with_its_own_data_only_wherever_they_lie(tmp_path: Path, 
     assert result.step == 6
 
 
-def test_depth_is_served_in_the_unit_that_was_asked_for(data, tmp_path, monkeypatch):
+def test_depth_is_served_in_the_unit_that_was_asked_for(lesson, tmp_path, monkeypatch):
     units, make = [], LeRobotDataset.__init__
 
     def made(self: LeRobotDataset, *args: Any, **options: Any) -> None:
@@ -414,13 +411,13 @@ def test_depth_is_served_in_the_unit_that_was_asked_for(data, tmp_path, monkeypa
         make(self, *args, **options)
 
     monkeypatch.setattr(LeRobotDataset, "__init__", made)
-    arguments = options(data, tmp_path / "run", MLP, steps=1, budget_gib=1e-9, dataset__depth_output_unit="m")
+    arguments = options(lesson, tmp_path / "run", MLP, steps=1, budget_gib=1e-9, dataset__depth_output_unit="m")
     run_train(arguments)  # depth is not kept in memory
     assert units == ["m"]
 
 
-def test_a_fingerprint_is_the_same_however_the_data_are_served(data: Path) -> None:
-    meta = LeRobotDatasetMetadata("t/t", root=data)
+def test_a_fingerprint_is_the_same_however_the_data_are_served(lesson: Path) -> None:
+    meta = LeRobotDatasetMetadata("t/t", root=lesson)
     keys = ["observation.state", "action"]
     served = [
         make_loader("t/t", LoaderConfig(batch_size=4, budget_gib=budget), meta=meta).dataset for budget in (1.0, 1e-9)

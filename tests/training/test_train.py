@@ -28,15 +28,10 @@ from bhd_lerobot.training.step import Learner, StepResult
 from tests.training.support import ACT, MLP, curve, make_dataset, options, run_train
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("data") / "set")
-
-
 @pytest.mark.figures
-def test_a_run_leaves_metrics_a_curve_its_configuration_and_checkpoints(data: Path, tmp_path: Path) -> None:
+def test_a_run_leaves_metrics_a_curve_its_configuration_and_checkpoints(lesson: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    result, printed = run_train(options(data, run, eval_steps=10, dataset__eval_split=0.3))
+    result, printed = run_train(options(lesson, run, eval_steps=10, dataset__eval_split=0.3))
     rows = curve(run)
     assert [row["step"] for row in rows] == [5, 10, 15, 20]
     assert [row["step"] for row in rows if "held_out_loss" in row] == [10, 20]
@@ -52,8 +47,8 @@ def test_a_run_leaves_metrics_a_curve_its_configuration_and_checkpoints(data: Pa
     assert config["policy"]["input_features"]["observation.state"]["shape"] == [4]
 
 
-def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "one", MLP, selection__outcome="success", selection__intervention_weight=3.0))
+def test_config_yaml_gives_the_same_run_again(lesson: Path, tmp_path: Path) -> None:
+    run_train(options(lesson, tmp_path / "one", MLP, selection__outcome="success", selection__intervention_weight=3.0))
     config = tmp_path / "one" / "config.yaml"
     run_train([f"--config_path={config}", f"--output_dir={tmp_path / 'two'}"])
     assert curve(tmp_path / "one") == curve(tmp_path / "two")
@@ -67,8 +62,8 @@ def test_config_yaml_gives_the_same_run_again(data: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
-def test_the_first_losses_are_those_of_lerobot_train(data, tmp_path, policy, monkeypatch):
-    result, _ = run_train(options(data, tmp_path / "ours", policy, log_freq=1, save_freq=0))
+def test_the_first_losses_are_those_of_lerobot_train(lesson, tmp_path, policy, monkeypatch):
+    result, _ = run_train(options(lesson, tmp_path / "ours", policy, log_freq=1, save_freq=0))
     values = json.loads((result.output_dir / "train_config.json").read_text())
     values |= {"output_dir": str(tmp_path / "stock"), "checkpoint_path": None, "optimizer": None, "scheduler": None}
     values["save_freq"] = 12
@@ -91,19 +86,19 @@ def test_the_first_losses_are_those_of_lerobot_train(data, tmp_path, policy, mon
     assert curve(tmp_path / "stock") == curve(tmp_path / "ours")[12:]
 
 
-def test_evaluating_does_not_change_the_training(data: Path, tmp_path: Path) -> None:
+def test_evaluating_does_not_change_the_training(lesson: Path, tmp_path: Path) -> None:
     split = {"dataset__eval_split": 0.3}
-    run_train(options(data, tmp_path / "one", **split))
-    run_train(options(data, tmp_path / "two", eval_steps=3, **split))
+    run_train(options(lesson, tmp_path / "one", **split))
+    run_train(options(lesson, tmp_path / "two", eval_steps=3, **split))
     losses = [[row["loss"] for row in curve(tmp_path / name) if "loss" in row] for name in ("one", "two")]
     assert losses[0] == losses[1]
 
 
 @pytest.mark.parametrize("budget", [4.0, 1e-6], ids=["in memory", "lerobot's loader"])
-def test_a_resumed_run_continues_to_the_same_bits(data, tmp_path, budget, monkeypatch):
+def test_a_resumed_run_continues_to_the_same_bits(lesson, tmp_path, budget, monkeypatch):
     # 12 is no multiple of log_freq, so a window of metrics is cut in two as well.
     common = {"save_freq": 12, "eval_steps": 10, "dataset__eval_split": 0.3, "budget_gib": budget}
-    _, printed = run_train(options(data, tmp_path / "whole", **common))
+    _, printed = run_train(options(lesson, tmp_path / "whole", **common))
     assert ("LeRobot's own loader" in printed) == (budget < 1)
 
     class KilledError(Exception):
@@ -117,7 +112,7 @@ def test_a_resumed_run_continues_to_the_same_bits(data, tmp_path, budget, monkey
 
     monkeypatch.setattr(checkpoint, "save", killed)
     with pytest.raises(KilledError):
-        run_train(options(data, tmp_path / "cut", **common))
+        run_train(options(lesson, tmp_path / "cut", **common))
     monkeypatch.undo()
     with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
         file.write('{"step": 13, "loss": 1}\n{"step": 14, "lo')  # what came after the checkpoint, and a torn line
@@ -130,7 +125,7 @@ def test_a_resumed_run_continues_to_the_same_bits(data, tmp_path, budget, monkey
     assert (tmp_path / "cut" / weights).read_bytes() == (tmp_path / "whole" / weights).read_bytes()
 
 
-def test_the_scale_of_gradients_in_half_precision_goes_on_where_it_was(data, tmp_path, monkeypatch):
+def test_the_scale_of_gradients_in_half_precision_goes_on_where_it_was(lesson, tmp_path, monkeypatch):
     """Only a GPU computes with it; its scale is the same anywhere."""
     scalers: list[torch.amp.GradScaler] = []
 
@@ -142,7 +137,7 @@ def test_the_scale_of_gradients_in_half_precision_goes_on_where_it_was(data, tmp
 
     monkeypatch.setattr(module, "make_accelerator", half)
     monkeypatch.setattr(Accelerator, "mixed_precision", property(lambda _: "fp16"))
-    run_train(options(data, tmp_path / "run", MLP, save_freq=12))
+    run_train(options(lesson, tmp_path / "run", MLP, save_freq=12))
     whole = curve(tmp_path / "run")
     run_train(["--resume=true", f"--config_path={tmp_path / 'run' / 'checkpoints' / '000012'}"])
     assert curve(tmp_path / "run") == whole
@@ -150,13 +145,13 @@ def test_the_scale_of_gradients_in_half_precision_goes_on_where_it_was(data, tmp
     assert scalers[0].get_scale() == 16.0 * 2**4
 
 
-def test_what_is_not_logged_is_not_kept(data: Path, tmp_path: Path) -> None:
-    result, _ = run_train(options(data, tmp_path / "run", MLP, steps=104, log_freq=0, save_freq=0))
+def test_what_is_not_logged_is_not_kept(lesson: Path, tmp_path: Path) -> None:
+    result, _ = run_train(options(lesson, tmp_path / "run", MLP, steps=104, log_freq=0, save_freq=0))
     assert result.checkpoint is not None
     assert len(json.loads((result.checkpoint / "training_state" / "bhd_loop.json").read_text())["window"]) == 4
 
 
-def test_a_signal_in_the_last_step_leaves_a_complete_run(data, tmp_path, hub, monkeypatch, capfd):
+def test_a_signal_in_the_last_step_leaves_a_complete_run(lesson, tmp_path, hub, monkeypatch, capfd):
     step, steps = Learner.step, itertools.count(1)
 
     def pressed(self: Learner, batch: dict) -> StepResult:
@@ -166,15 +161,15 @@ def test_a_signal_in_the_last_step_leaves_a_complete_run(data, tmp_path, hub, mo
 
     monkeypatch.setattr(Learner, "step", pressed)
     pushed = {"policy.repo_id": "me/p", "policy.push_to_hub": True}
-    assert main(options(data, tmp_path / "run", MLP | pushed, steps=5)) == 130
+    assert main(options(lesson, tmp_path / "run", MLP | pushed, steps=5)) == 130
     assert "model.safetensors" in hub.repositories["models/me/p"].files()
     assert "--resume=true" not in capfd.readouterr().err  # there is nothing to continue
 
 
-def test_ctrl_c_saves_and_prints_the_resume_command(data, tmp_path, monkeypatch, capfd):
+def test_ctrl_c_saves_and_prints_the_resume_command(lesson, tmp_path, monkeypatch, capfd):
     run = tmp_path / "run"
     common = {"steps": 30, "save_freq": 0, "policy": MLP}
-    run_train(options(data, tmp_path / "whole", **common))
+    run_train(options(lesson, tmp_path / "whole", **common))
     append = MetricsFile.append
 
     def press(self: MetricsFile, row: dict) -> None:
@@ -183,7 +178,7 @@ def test_ctrl_c_saves_and_prints_the_resume_command(data, tmp_path, monkeypatch,
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(MetricsFile, "append", press)
-    assert main(options(data, run, **common)) == 130
+    assert main(options(lesson, run, **common)) == 130
     monkeypatch.undo()
     path = run / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
     assert f"bhd-train --resume=true --config_path={path}" in capfd.readouterr().err
@@ -192,7 +187,7 @@ def test_ctrl_c_saves_and_prints_the_resume_command(data, tmp_path, monkeypatch,
     assert curve(run) == curve(tmp_path / "whole")
 
 
-def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(data, tmp_path, monkeypatch):
+def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(lesson, tmp_path, monkeypatch):
     run = tmp_path / "run"
     calls = []
     flush = checkpoint._flush
@@ -209,7 +204,7 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(data, tmp_pa
 
     monkeypatch.setattr(checkpoint, "_flush", die_the_second_time)
     with pytest.raises(Killed):
-        run_train(options(data, run, MLP))
+        run_train(options(lesson, run, MLP))
     monkeypatch.undo()
     assert os.readlink(run / "checkpoints" / "last") == "000010"
     assert (run / "checkpoints" / ".000020.part").is_dir()
@@ -219,7 +214,7 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(data, tmp_pa
 
 
 @pytest.mark.law
-def test_a_full_disk_ends_with_the_checkpoint_before_intact(data, tmp_path, monkeypatch):
+def test_a_full_disk_ends_with_the_checkpoint_before_intact(lesson, tmp_path, monkeypatch):
     save = checkpoint.save_checkpoint
 
     def full(folder: Path, step: int, *args, **kwargs):
@@ -229,12 +224,14 @@ def test_a_full_disk_ends_with_the_checkpoint_before_intact(data, tmp_path, monk
 
     monkeypatch.setattr(checkpoint, "save_checkpoint", full)
     with pytest.raises(BhdError, match=r"checkpoint of step 20 .* No space left"):
-        run_train(options(data, tmp_path / "run", MLP))
+        run_train(options(lesson, tmp_path / "run", MLP))
     assert sorted(one.name for one in (tmp_path / "run" / "checkpoints").iterdir()) == ["000010", "last"]
 
 
-def test_a_finished_run_names_the_option_to_continue_and_resumes_where_it_was_moved(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "run", MLP, steps=5))
+def test_a_finished_run_names_the_option_to_continue_and_resumes_where_it_was_moved(
+    lesson: Path, tmp_path: Path
+) -> None:
+    run_train(options(lesson, tmp_path / "run", MLP, steps=5))
     with pytest.raises(ConfigError, match=r"5 of 5 steps.*--steps"):
         run_train(["--resume=true", f"--config_path={tmp_path / 'run'}"])
     (tmp_path / "run").rename(tmp_path / "moved")
@@ -243,8 +240,8 @@ def test_a_finished_run_names_the_option_to_continue_and_resumes_where_it_was_mo
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_is_resumed_where_a_copy_made_a_folder_of_a_link_or_lost_it(data: Path, tmp_path: Path) -> None:
-    run_train(options(data, tmp_path / "run", MLP, steps=4, save_freq=2))
+def test_a_run_is_resumed_where_a_copy_made_a_folder_of_a_link_or_lost_it(lesson: Path, tmp_path: Path) -> None:
+    run_train(options(lesson, tmp_path / "run", MLP, steps=4, save_freq=2))
     followed, lost = (shutil.copytree(tmp_path / "run", tmp_path / name) for name in ("followed", "lost"))
     shutil.rmtree(lost / "checkpoints" / "last")
     for run in (followed, lost):
@@ -254,21 +251,21 @@ def test_a_run_is_resumed_where_a_copy_made_a_folder_of_a_link_or_lost_it(data: 
         assert os.readlink(run / "checkpoints" / "last") == "000006"
 
 
-def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(data, tmp_path, monkeypatch):
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(lesson, tmp_path, monkeypatch):
     def meanwhile(*args: Any, **kwargs: Any) -> TrainingData:
         (tmp_path / "run").mkdir()
         return open_data(*args, **kwargs)
 
     monkeypatch.setattr(module, "open_data", meanwhile)
-    result, printed = run_train(options(data, tmp_path / "run", MLP, steps=1))
+    result, printed = run_train(options(lesson, tmp_path / "run", MLP, steps=1))
     assert result.output_dir == tmp_path / "run_2"
     assert str(result.output_dir) in printed
     assert list((tmp_path / "run").iterdir()) == []
 
 
-def test_only_the_chosen_episodes_and_frames_are_learned_from(data: Path, tmp_path: Path) -> None:
+def test_only_the_chosen_episodes_and_frames_are_learned_from(lesson: Path, tmp_path: Path) -> None:
     chosen = {"selection__outcome": "[success, collision]", "selection__min_score": 0.2}
-    arguments = options(data, tmp_path / "run", steps=2, selection__intervention_weight=0, **chosen)
+    arguments = options(lesson, tmp_path / "run", steps=2, selection__intervention_weight=0, **chosen)
     _, printed = run_train(arguments)
     assert f"4 episodes, {4 * 17} samples in an epoch" in printed
     saved = json.loads((tmp_path / "run" / "train_config.json").read_text())
@@ -312,15 +309,15 @@ def test_an_input_that_never_changes_is_warned_of_where_it_would_count(tmp_path:
 
 
 @pytest.mark.parametrize("policy", [ACT, MLP], ids=["act", "bhd_mlp"])
-def test_a_policy_that_is_pushed_holds_no_path_of_this_machine(data, tmp_path, hub, policy):
+def test_a_policy_that_is_pushed_holds_no_path_of_this_machine(lesson, tmp_path, hub, policy):
     run = tmp_path / "run"
     pushed = {"policy.repo_id": "me/p", "policy.push_to_hub": True}
-    run_train(options(data, run, policy | pushed, steps=5))
+    run_train(options(lesson, run, policy | pushed, steps=5))
     files = {path: blob.content for path, blob in hub.repositories["models/me/p"].files().items()}
     assert {"config.json", "train_config.json", "README.md", "model.safetensors"} <= set(files)
-    assert json.loads(files["train_config.json"])["dataset"]["root"] == data.name
+    assert json.loads(files["train_config.json"])["dataset"]["root"] == lesson.name
     for path, content in files.items():
         assert str(tmp_path.parent).encode() not in content, path
-        assert str(data.parent).encode() not in content, path
+        assert str(lesson.parent).encode() not in content, path
     # What stays on this machine can be resumed.
-    assert json.loads((run / "train_config.json").read_text())["dataset"]["root"] == str(data)
+    assert json.loads((run / "train_config.json").read_text())["dataset"]["root"] == str(lesson)

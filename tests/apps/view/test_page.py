@@ -14,7 +14,7 @@ from bhd_lerobot.datasets.edit.edits import delete
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from tests.apps.browser import ARGUMENTS, found_browser, opened, wait_until
 from tests.apps.view.support import Served, served
-from tests.datasets.loader.support import FRONT, PHOTO, WRIST, images, length, record_ours, record_stock
+from tests.datasets.loader.support import FRONT, PHOTO, WRIST, images, length, record_ours
 
 
 @pytest.fixture(scope="module")
@@ -395,8 +395,8 @@ def test_an_episode_is_downloaded(browser, base) -> None:
         assert Path(started.value.path()).read_text().startswith('"frame","time_s","')
 
 
-def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, tmp_path) -> None:
-    with served(record_stock(tmp_path / "stock", cameras=True)) as server, opened(browser, server.url) as page:
+def test_a_dataset_of_stock_lerobot_and_odd_ones(browser, stock, tmp_path) -> None:
+    with served(stock) as server, opened(browser, server.url) as page:
         assert page.text_content(".card-a .badge") == "not judged"
         wait_until(page, "document.querySelector('video').readyState >= 2")  # AV1
         scrub(page, 0.59)

@@ -48,15 +48,6 @@ def ur5(tmp_path_factory):
     return root
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory):
-    root = tmp_path_factory.mktemp("export") / "toy"
-    with support.create(root, video=True) as recorder:
-        for _ in range(2):
-            support.record(recorder, video=True)
-    return root
-
-
 def export(root, output, *arguments):
     assert main.main(["export", str(root), f"--output={output}", *arguments]) == 0
     return output
@@ -116,8 +107,8 @@ def stamp(message):
 
 
 @pytest.mark.parametrize("compressed", [[], ["--compressed_images"]])
-def test_texts_and_images_of_an_unknown_robot(toy, tmp_path, capsys, compressed):
-    bags = export(toy, tmp_path / "my bags", *compressed)
+def test_texts_and_images_of_an_unknown_robot(video_episodes, tmp_path, capsys, compressed):
+    bags = export(video_episodes, tmp_path / "my bags", *compressed)
     assert f"Play one: ros2 bag play '{bags}/episode_000000'" in capsys.readouterr().out
     topics = decoded(bags / "episode_000001/episode_000001.mcap")
     assert "/bhd/observation_state" in topics

@@ -5,19 +5,12 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 
 from bhd_lerobot.cli.data import main
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.options.parse import parse
 from bhd_lerobot.training.config import BhdTrainConfig
 from tests.fake_hub.hub import FakeHub
-from tests.training.support import make_dataset
-
-
-@pytest.fixture(scope="module")
-def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
 
 
 def test_some_episodes_by_outcome(hub: FakeHub, lesson: Path, tmp_path: Path, capsys) -> None:

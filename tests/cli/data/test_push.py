@@ -34,18 +34,6 @@ from tests.training.support import options as train_options
 from tests.waiting import until
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("recorded") / "d"
-    run_record(root, n_envs=2, seed=4, dataset__num_episodes=4)
-    return root
-
-
-@pytest.fixture(scope="module")
-def lesson(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("lesson") / "set")
-
-
 @pytest.fixture
 def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder, which is empty."""
@@ -57,15 +45,15 @@ def text_of(hub: FakeHub, name: str, path: str = "README.md") -> str:
     return hub.dataset(name).files()[path].content.decode()
 
 
-def test_there_and_back(hub: FakeHub, recorded: Path, tmp_path: Path, capsys) -> None:
-    before = content(recorded)
-    assert main.main(["push", str(recorded), "me/avoid"]) == 0
-    assert "me/avoid: 4 episodes\n  sent" in capsys.readouterr().out
-    assert main.main(["push", str(recorded), "--repo_id=me/avoid"]) == 0
+def test_there_and_back(hub: FakeHub, drives: Path, tmp_path: Path, capsys) -> None:
+    before = content(drives)
+    assert main.main(["push", str(drives), "me/avoid"]) == 0
+    assert "me/avoid: 3 episodes\n  sent" in capsys.readouterr().out
+    assert main.main(["push", str(drives), "--repo_id=me/avoid"]) == 0
     assert "nothing to send" in capsys.readouterr().out
     assert main.main(["pull", "me/avoid", f"--root={tmp_path / 'e'}"]) == 0
     assert "fetched" in capsys.readouterr().out
-    assert content(recorded) == before
+    assert content(drives) == before
     assert {**content(tmp_path / "e")} == before | {
         name: hub.dataset("me/avoid").files()[name].content for name in ("README.md", "preview.png")
     }
@@ -78,8 +66,8 @@ def test_there_and_back(hub: FakeHub, recorded: Path, tmp_path: Path, capsys) ->
 
 
 @pytest.mark.figures
-def test_the_card_says_what_is_in_the_dataset(hub: FakeHub, recorded: Path) -> None:
-    assert main.main(["push", str(recorded), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
+def test_the_card_says_what_is_in_the_dataset(hub: FakeHub, drives: Path) -> None:
+    assert main.main(["push", str(drives), "me/avoid", "--tags=roaming,small", "--licence=mit"]) == 0
     card = text_of(hub, "me/avoid")
     assert is_generated(card.encode())
     front = yaml.safe_load(card.split("---\n")[1])
@@ -87,20 +75,20 @@ def test_the_card_says_what_is_in_the_dataset(hub: FakeHub, recorded: Path) -> N
     assert front["task_categories"] == ["robotics"]
     assert front["tags"] == ["LeRobot", "bhd_lerobot", "turtlebot3", "avoid", "roaming", "small"]
     assert front["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
-    summary = dataset_info(recorded)
+    summary = dataset_info(drives)
     for key in summary.features:
         assert f"| `{key}` |" in card
     assert "m/s" in card
     outcomes = [str(episode.metadata["outcome"]) for episode in summary.episodes]
     for outcome in set(outcomes):
-        assert f"| {outcome} | {outcomes.count(outcome)} | {25 * outcomes.count(outcome)} % |" in card
+        assert f"| {outcome} | {outcomes.count(outcome)} | {100 * outcomes.count(outcome) / 3:.0f} % |" in card
     successes = sum(bool(episode.metadata["success"]) for episode in summary.episodes)
-    share = wilson(successes, 4)
-    assert f"{successes} of 4 episodes succeeded: {100 * share.value:.1f} %" in card
+    share = wilson(successes, 3)
+    assert f"{successes} of 3 episodes succeeded: {100 * share.value:.1f} %" in card
     assert f"{100 * share.low:.1f} to {100 * share.high:.1f} %" in card
     folded = re.search(r"<details>.*```json\n(.*)\n```\n\n</details>", card, re.DOTALL)
     assert folded is not None
-    assert json.loads(folded[1]) == json.loads((recorded / "meta/bhd.json").read_text())
+    assert json.loads(folded[1]) == json.loads((drives / "meta/bhd.json").read_text())
     assert 'LeRobotDataset("me/avoid")' in card
     assert "](preview.png)" in card
     preview = hub.dataset("me/avoid").files()["preview.png"].content
@@ -219,15 +207,15 @@ def test_a_policy_that_cannot_be_uploaded_is_kept(hub: FakeHub, lesson: Path, tm
 
 
 @pytest.mark.thorough
-def test_streaming_gives_the_same_samples(hub: FakeHub, recorded: Path, monkeypatch) -> None:
+def test_streaming_gives_the_same_samples(hub: FakeHub, drives: Path, monkeypatch) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 
-    assert main.main(["push", str(recorded), "me/avoid"]) == 0
+    assert main.main(["push", str(drives), "me/avoid"]) == 0
     monkeypatch.setattr("datasets.config.HF_HUB_OFFLINE", False)
     deltas = {"action": [0.0, 0.1, 0.2]}
-    reference = LeRobotDataset("t/t", root=recorded, delta_timestamps=deltas)
-    for where in ({"repo_id": "me/avoid"}, {"repo_id": "t/t", "root": recorded}):
+    reference = LeRobotDataset("t/t", root=drives, delta_timestamps=deltas)
+    for where in ({"repo_id": "me/avoid"}, {"repo_id": "t/t", "root": drives}):
         streamed = StreamingLeRobotDataset(**where, delta_timestamps=deltas, buffer_size=20, shuffle=False)  # type: ignore
         seen = set()
         for sample in streamed:

@@ -32,11 +32,6 @@ from tests.datasets import support
 from tests.datasets.edit_support import NUMBERS, assert_valid, content, record
 
 
-@pytest.fixture(scope="module")
-def video_dataset(tmp_path_factory) -> Path:
-    return record(tmp_path_factory.mktemp("video_dataset") / "d", list(range(4)), video=True)
-
-
 @pytest.mark.parametrize("video", [False, True])
 def test_merge_gives_all_episodes_in_order(tmp_path: Path, video: bool) -> None:
     parts = [record(tmp_path / f"d{i}", episodes, video=video) for i, episodes in enumerate([[3, 1], [0], [5, 4, 2]])]
@@ -88,13 +83,13 @@ def test_an_edited_dataset_is_not_continued(six_episodes: Path, tmp_path: Path) 
 
 
 def test_filter_gives_the_wanted_episodes_in_the_wanted_order(
-    six_episodes: Path, video_dataset: Path, tmp_path: Path
+    six_episodes: Path, video_episodes: Path, tmp_path: Path
 ) -> None:
     cases = [
         (six_episodes, [0]),
         (six_episodes, [5, 2, 0]),
         (six_episodes, [0, 1, 2, 3, 4, 5]),
-        (video_dataset, [3, 1]),
+        (video_episodes, [2, 1]),
     ]
     for number, (source, wanted) in enumerate(cases):
         keep(source, wanted, tmp_path / str(number))
@@ -304,29 +299,29 @@ def test_deviations_that_cannot_be_those_of_the_data_are_computed_from_the_new_c
         assert not [finding for finding in check_dataset(root).findings if finding.check == "stats"], name
 
 
-def test_datasets_share_no_file(six_episodes: Path, video_dataset: Path, tmp_path: Path) -> None:
+def test_datasets_share_no_file(six_episodes: Path, video_episodes: Path, tmp_path: Path) -> None:
     """Other programs write into files; what happens to one dataset must not happen to another."""
-    for number, source in enumerate((six_episodes, video_dataset)):
-        keep(source, range(4), tmp_path / f"k{number}")
-        split(source, {"all": range(4)}, tmp_path / f"s{number}")
+    for number, source in enumerate((six_episodes, video_episodes)):
+        keep(source, range(3), tmp_path / f"k{number}")
+        split(source, {"all": range(3)}, tmp_path / f"s{number}")
         for path in tmp_path.rglob("*"):
             assert path.is_dir() or path.stat().st_nlink == 1, path
 
 
-def test_links_of_a_cache_are_followed(video_dataset: Path, tmp_path: Path) -> None:
+def test_links_of_a_cache_are_followed(video_episodes: Path, tmp_path: Path) -> None:
     """The Hub's client keeps datasets as relative links."""
     cache = tmp_path / "datasets--me--d"
     (cache / "blobs").mkdir(parents=True)
     snapshot = cache / "snapshots" / "abc"
-    for number, path in enumerate(one for one in sorted(video_dataset.rglob("*")) if one.is_file()):
-        blob, link = cache / "blobs" / str(number), snapshot / path.relative_to(video_dataset)
+    for number, path in enumerate(one for one in sorted(video_episodes.rglob("*")) if one.is_file()):
+        blob, link = cache / "blobs" / str(number), snapshot / path.relative_to(video_episodes)
         shutil.copy(path, blob)
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(os.path.relpath(blob, link.parent))
-    keep(snapshot, range(4), tmp_path / "kept")
-    assert content(tmp_path / "kept") == content(video_dataset)
+    keep(snapshot, range(3), tmp_path / "kept")
+    assert content(tmp_path / "kept") == content(video_episodes)
     mark(snapshot, [0], outcome="stuck")
-    assert content(snapshot)[1:] == content(video_dataset)[1:]
+    assert content(snapshot)[1:] == content(video_episodes)[1:]
 
 
 def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:
@@ -346,13 +341,13 @@ def test_instructions_of_an_episode_that_has_several(tmp_path: Path) -> None:
     assert [loaded[index]["task"] for index in (0, 3, 4, 7)] == ["2", "end", "1", "end"]
 
 
-def test_depth_of_another_scale_does_not_merge(video_dataset: Path, tmp_path: Path) -> None:
-    other = shutil.copytree(video_dataset, tmp_path / "other")
+def test_depth_of_another_scale_does_not_merge(video_episodes: Path, tmp_path: Path) -> None:
+    other = shutil.copytree(video_episodes, tmp_path / "other")
     info = json.loads((other / "meta/info.json").read_text())
     info["features"][support.CAMERA]["info"]["video.depth_max"] = 3.0
     (other / "meta/info.json").write_text(json.dumps(info))
     with pytest.raises(DatasetMismatchError, match=r"depth_max: not"):
-        merge([video_dataset, other], tmp_path / "all")
+        merge([video_episodes, other], tmp_path / "all")
 
 
 def test_files_at_other_places_are_refused_by_name(six_episodes: Path, tmp_path: Path) -> None:

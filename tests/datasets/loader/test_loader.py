@@ -35,12 +35,6 @@ def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return support.record_light(tmp_path_factory.mktemp("video_dataset") / "d", 4, (FRONT, WRIST))
 
 
-@pytest.fixture(scope="module")
-def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """By stock LeRobot, with video, images in the data files and a matrix."""
-    return support.record_stock(tmp_path_factory.mktemp("foreign") / "d", cameras=True)
-
-
 def both(root: Path, **options: Any) -> tuple[TableDataset, Any]:
     return TableDataset("t/t", root, **options), support.stock(root, **options)
 
@@ -84,8 +78,8 @@ def test_frames_of_other_codecs_are_those_of_lerobot_with_any_number_of_threads(
 @each_case(
     ("episodes", "deltas"), [(None, None), ([2, 0], {"action": CHUNK, "grid": WINDOW, FRONT: WINDOW, PHOTO: [0.0]})]
 )
-def test_a_dataset_that_stock_lerobot_recorded(foreign, episodes, deltas):
-    assert_equal_datasets(foreign, episodes=episodes, delta_timestamps=deltas)
+def test_a_dataset_that_stock_lerobot_recorded(stock, episodes, deltas):
+    assert_equal_datasets(stock, episodes=episodes, delta_timestamps=deltas)
 
 
 def test_random_transforms_draw_as_in_lerobot(video_dataset: Path) -> None:

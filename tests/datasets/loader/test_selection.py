@@ -45,11 +45,6 @@ def video_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return support.record_light(tmp_path_factory.mktemp("video_dataset") / "d", 2, (FRONT, WRIST))
 
 
-@pytest.fixture(scope="module")
-def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return support.record_stock(tmp_path_factory.mktemp("foreign") / "d")
-
-
 @each_case(
     ("options", "wanted"),
     [
@@ -67,8 +62,8 @@ def test_episodes_by_what_is_stored_about_them(plain: Path, options: dict[str, A
     assert chosen == [episode for episode in wanted if episode >= 2]
 
 
-def test_filters_of_what_was_not_recorded(foreign: Path) -> None:
-    meta = open_metadata(foreign)
+def test_filters_of_what_was_not_recorded(stock: Path) -> None:
+    meta = open_metadata(stock)
     with pytest.raises(DatasetError, match=r"has no bhd/outcome .* another program .* outcome 'all'"):
         EpisodeFilter().select(meta)
     assert EpisodeFilter("all").select(meta) == [0, 1, 2]
@@ -120,7 +115,7 @@ def test_a_split_that_leaves_nothing(plain: Path) -> None:
         split_episodes(open_metadata(plain), [3], 0.1)
 
 
-def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> None:
+def test_interventions_are_weighted_or_dropped(plain: Path, stock: Path) -> None:
     meta = open_metadata(plain)
     place = sum(support.length(episode) for episode in (0, 1)) + 1
     weights = frame_weights(meta, None, intervention=3.0)
@@ -132,7 +127,7 @@ def test_interventions_are_weighted_or_dropped(plain: Path, foreign: Path) -> No
     drawn = torch.cat([batch["index"] for batch in loader])
     assert sorted(drawn.tolist()) == [i for i in range(meta.total_frames) if i != place]
     with pytest.raises(DatasetError, match="no column 'event'"):
-        frame_weights(open_metadata(foreign), None, intervention=0.0)
+        frame_weights(open_metadata(stock), None, intervention=0.0)
 
 
 @each_case(("intervention", "learner"), [(0.0, 1.0), (3.0, 1.0), (1.0, 0.5), (2.0, 0.0)])

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ class Operation:
     Attributes:
         name: for the report.
         prepare: puts into a folder what the command needs; called once, and copied for each run.
-        argv: the command line, in that folder.
+        command: the command line; {f} stands for that folder.
         target: what the command makes or changes.
         is_new: whether nothing is there before.
         places: "no exchange" of names by the file system, or a "fixed" folder, such as a mount point.
@@ -38,13 +39,17 @@ class Operation:
 
     name: str
     prepare: Callable[[Path], object]
-    argv: Callable[[Path], list[str]]
+    command: str
     target: str
     is_new: bool = False
     places: tuple[str, ...] = ("plain",)
     is_refused: bool = False
     repeated: int = 0
     says: str = ""
+
+    def argv(self, folder: Path) -> list[str]:
+        """Return the arguments, in a folder."""
+        return [word.format(f=folder) for word in shlex.split(self.command)]
 
 
 def dataset(folder: Path, name: str = "d 1", episodes: int = 4) -> Path:
@@ -128,104 +133,41 @@ def _killed(folder: Path) -> None:
     (folder / "d 1/.bhd/episode-3").mkdir(parents=True)
 
 
-def _edit(*words: str) -> Callable[[Path], list[str]]:
-    return lambda folder: [words[0], str(folder / "d 1"), *words[1:]]
-
-
 ANYWHERE = ("plain", "no exchange")
 NEW_ANYWHERE = ("plain", "fixed")
 EXISTS = {"is_new": True, "repeated": 2, "says": "exists already", "places": NEW_ANYWHERE}
 OPERATIONS = (
     Operation(
-        "delete", dataset, _edit("delete", "--episodes=1"), "d 1", places=ANYWHERE, says="nothing was changed now"
+        "delete", dataset, "delete '{f}/d 1' --episodes=1", "d 1", places=ANYWHERE, says="nothing was changed now"
     ),
-    Operation("mark", dataset, _edit("mark", "--episodes=1", "--outcome=failure"), "d 1", says="changed now"),
-    Operation("fix", _without_stats, _edit("check", "--fix"), "d 1"),
-    Operation("fix the count", _miscounted, _edit("check", "--fix"), "d 1", places=ANYWHERE, is_refused=True),
-    Operation("fix everything", _disordered, _edit("check", "--fix"), "d 1", places=ANYWHERE, is_refused=True),
-    Operation("repair the order", _shuffled, _edit("repair"), "d 1", places=ANYWHERE),
-    Operation("repair damage", _cut, _edit("repair"), "d 1", places=ANYWHERE, is_refused=True),
+    Operation("mark", dataset, "mark '{f}/d 1' --episodes=1 --outcome=failure", "d 1", says="changed now"),
+    Operation("fix", _without_stats, "check '{f}/d 1' --fix", "d 1"),
+    Operation("fix the count", _miscounted, "check '{f}/d 1' --fix", "d 1", places=ANYWHERE, is_refused=True),
+    Operation("fix everything", _disordered, "check '{f}/d 1' --fix", "d 1", places=ANYWHERE, is_refused=True),
+    Operation("repair the order", _shuffled, "repair '{f}/d 1'", "d 1", places=ANYWHERE),
+    Operation("repair damage", _cut, "repair '{f}/d 1'", "d 1", places=ANYWHERE, is_refused=True),
     Operation(
-        "repair with the info of another",
-        _without_info,
-        lambda folder: ["repair", str(folder / "d 1"), "--info", str(folder / "info.json")],
-        "d 1",
-        is_refused=True,
-        repeated=2,
-        says="can be read and fits its data",
+        "repair with the info of another", _without_info, "repair '{f}/d 1' --info {f}/info.json", "d 1",
+        is_refused=True, repeated=2, says="can be read and fits its data",
     ),
-    Operation("repair", _killed, _edit("repair"), "d 1", places=ANYWHERE),
-    Operation("resume", _killed, lambda folder: ["record", str(folder / "d 1"), "5"], "d 1"),
+    Operation("repair", _killed, "repair '{f}/d 1'", "d 1", places=ANYWHERE),
+    Operation("resume", _killed, "record '{f}/d 1' 5", "d 1"),
+    Operation("record", lambda folder: None, "record '{f}/d 1' 2", "d 1", is_new=True, places=NEW_ANYWHERE),
+    Operation("merge", _two, "merge {f}/a {f}/b --output {f}/all", "all", **EXISTS),
+    Operation("filter", dataset, "filter '{f}/d 1' --episodes=0,2 --output {f}/some", "some", **EXISTS),
+    Operation("split", dataset, "split '{f}/d 1' --parts=x=0.5,y=0.5 --output {f}/parts", "parts", **EXISTS),
     Operation(
-        "record",
-        lambda folder: None,
-        lambda folder: ["record", str(folder / "d 1"), "2"],
-        "d 1",
-        is_new=True,
-        places=NEW_ANYWHERE,
+        "split into a folder", _into, "split '{f}/d 1' --parts=x=0.5,y=0.5 --output {f}/parts", "parts",
+        repeated=2, says="exists already",
     ),
+    Operation("export", lambda folder: dataset(folder, "d", 2), "export {f}/d --output {f}/bags", "bags", **EXISTS),
+    Operation("import", _bag, "import {f}/bag --task=Drive. --beams=36 --repo_id=t/t --root {f}/new", "new", **EXISTS),
+    Operation("pull", _afar, "pull file://{f}/afar --root {f}/new", "new", is_new=True, places=NEW_ANYWHERE),
     Operation(
-        "merge",
-        _two,
-        lambda folder: ["merge", str(folder / "a"), str(folder / "b"), "--output", str(folder / "all")],
-        "all",
-        **EXISTS,
-    ),
-    Operation(
-        "filter",
-        dataset,
-        lambda folder: ["filter", str(folder / "d 1"), "--episodes=0,2", "--output", str(folder / "some")],
-        "some",
-        **EXISTS,
-    ),
-    Operation(
-        "split",
-        dataset,
-        lambda folder: ["split", str(folder / "d 1"), "--parts=x=0.5,y=0.5", "--output", str(folder / "parts")],
-        "parts",
-        **EXISTS,
-    ),
-    Operation(
-        "split into a folder",
-        _into,
-        lambda folder: ["split", str(folder / "d 1"), "--parts=x=0.5,y=0.5", "--output", str(folder / "parts")],
-        "parts",
-        repeated=2,
-        says="exists already",
-    ),
-    Operation(
-        "export",
-        lambda folder: record(folder / "d", [0, 1]),
-        lambda folder: ["export", str(folder / "d"), "--output", str(folder / "bags")],
-        "bags",
-        **EXISTS,
-    ),
-    Operation(
-        "import",
-        _bag,
-        lambda folder: [
-            *("import", str(folder / "bag"), "--task=Drive.", "--beams=36"),
-            *("--repo_id=t/t", "--root", str(folder / "new")),
-        ],
-        "new",
-        **EXISTS,
-    ),
-    Operation(
-        "pull",
-        _afar,
-        lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "new")],
-        "new",
-        is_new=True,
-        places=NEW_ANYWHERE,
-    ),
-    Operation(
-        "pull in the place of another",
-        _afar_and_here,
-        lambda folder: ["pull", f"file://{folder}/afar", "--root", str(folder / "d 1"), "--replace"],
-        "d 1",
+        "pull in the place of another", _afar_and_here, "pull file://{f}/afar --root '{f}/d 1' --replace", "d 1",
         places=(*ANYWHERE, "fixed"),
     ),
-)
+)  # fmt: skip
 
 
 REFUSED = "refused by LeRobot"

@@ -106,9 +106,8 @@ def test_a_valid_dataset_has_no_finding_and_is_not_changed(valid: Path) -> None:
     assert snapshot(valid) == before
 
 
-def test_a_dataset_of_stock_lerobot_is_valid(tmp_path: Path) -> None:
-    root = loader_support.record_stock(tmp_path / "stock", cameras=True)
-    assert [finding for finding in check_dataset(root).findings if finding.severity == Severity.ERROR] == []
+def test_a_dataset_of_stock_lerobot_is_valid(stock: Path) -> None:
+    assert [finding for finding in check_dataset(stock).findings if finding.severity == Severity.ERROR] == []
 
 
 OBS = "observation.state"

@@ -38,6 +38,7 @@ from bhd_lerobot.training.rl.parts import make_parts, single_action
 from bhd_lerobot.training.rl.train import RlResult, train
 from tests.forks import Fork
 from tests.policies.learned.rig import save_policy
+from tests.recording.support import command_line
 
 # How much the network's rows may differ when they are computed beside others, in m/s and rad/s.
 TOLERANCE = 2e-6
@@ -67,10 +68,7 @@ BASE = {
 
 
 def options(root: Path | None = None, **overrides: object) -> list[str]:
-    values = {**BASE, **{key.replace("__", "."): value for key, value in overrides.items()}}
-    if root is not None:
-        values["output_dir"] = root
-    return [f"--{key}={value}" for key, value in values.items() if value is not None]
+    return command_line({**BASE, "output_dir": root}, overrides)
 
 
 def run(root: Path, **overrides: object) -> RlResult:
