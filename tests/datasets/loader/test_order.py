@@ -81,7 +81,11 @@ def test_it_goes_on_after_any_batch(batches: int, world_size: int, drop_last: bo
 
     def endless(order: BatchOrder) -> Any:
         while True:
-            yield from order
+            epoch = iter(order)
+            first = next(epoch, None)
+            assert first is not None, "an epoch without a batch"
+            yield first
+            yield from epoch
 
     order = make()
     stream = endless(order)
