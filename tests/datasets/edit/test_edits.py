@@ -22,6 +22,7 @@ from bhd_lerobot.datasets.storage.disk import RootLock
 from bhd_lerobot.datasets.validate.dataset import check_dataset
 from bhd_lerobot.datasets.writer.recorder import DatasetRecorder
 from bhd_lerobot.errors import (
+    ConfigError,
     DatasetError,
     DatasetLockedError,
     DatasetMismatchError,
@@ -96,6 +97,8 @@ def test_filter_gives_the_wanted_episodes_in_the_wanted_order(
         whole = content(source)  # every pixel, too
         assert content(tmp_path / str(number)) == [whole[episode] for episode in wanted]
         assert_valid(tmp_path / str(number))
+    with pytest.raises(ConfigError, match="Episode 1 is named twice"):
+        keep(six_episodes, [1, 1], tmp_path / "twice")
 
 
 @pytest.mark.law

@@ -1,9 +1,12 @@
 """Batches from memory are LeRobot's, key by key and bit by bit."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -80,6 +83,29 @@ def test_frames_of_other_codecs_are_those_of_lerobot_with_any_number_of_threads(
 )
 def test_a_dataset_that_stock_lerobot_recorded(stock, episodes, deltas):
     assert_equal_datasets(stock, episodes=episodes, delta_timestamps=deltas)
+
+
+def test_images_beside_the_table_are_read_and_none_outside_of_the_dataset(stock: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(stock, tmp_path / "d"))
+    (root / "images").mkdir(exist_ok=True)
+    (file,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(file)
+    column = table.column_names.index(PHOTO)
+    names = [f"images/{row}.png" for row in range(len(table))]
+    for name, image in zip(names, table[PHOTO].to_pylist(), strict=True):
+        (root / name).write_bytes(image["bytes"])
+
+    def name_images(names: list[str]) -> None:
+        images = pa.array([{"bytes": None, "path": name} for name in names], table.schema.field(PHOTO).type)
+        pq.write_table(table.set_column(column, table.schema.field(PHOTO), images), file)
+
+    name_images(names)
+    rows = torch.arange(len(table))
+    assert torch.equal(TableDataset("t/t", root).batch(rows)[PHOTO], TableDataset("t/t", stock).batch(rows)[PHOTO])
+    (root / names[0]).rename(tmp_path / "mine.png")
+    name_images(["../mine.png", *names[1:]])
+    with pytest.raises(DatasetError, match="outside of the dataset"):
+        TableDataset("t/t", root)
 
 
 def test_random_transforms_draw_as_in_lerobot(video_dataset: Path) -> None:

@@ -98,3 +98,13 @@ def test_a_folder_behind_a_link_is_not_removed_from_the_hub(hub, root, tmp_path,
         with pytest.raises(DatasetError, match=message):
             send(copied)
     assert HubDataset("me/d").files() == before
+
+
+def test_a_note_that_is_a_link_to_the_outside_is_not_sent(hub: FakeHub, root: Path, tmp_path: Path) -> None:
+    (tmp_path / "outside").write_text("password")
+    (root / ".step").symlink_to(tmp_path / "outside")
+    (root / "notes.txt").symlink_to(root / ".step")  # by way of a link that stays inside
+    with pytest.raises(DatasetError, match=r"notes.txt is a link to .*outside, outside of the dataset.*cp -rL"):
+        send(root)
+    assert not hub.repositories  # no request was sent to the Hub
+    send(Path(shutil.copytree(root, tmp_path / "whole")))  # which follows links, as cp -rL does

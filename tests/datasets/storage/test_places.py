@@ -24,6 +24,7 @@ from bhd_lerobot.datasets.remote.store import StoreDataset
 from bhd_lerobot.datasets.storage import layout
 from bhd_lerobot.datasets.storage.places import (
     LINKED_FOLDERS,
+    check_inside,
     check_links,
     wrong_info,
     wrong_name,
@@ -218,6 +219,15 @@ def test_a_folder_that_only_looks_like_a_cache(root: Path, tmp_path: Path) -> No
     (repository / "blobs").mkdir()
     (repository / "blobs" / "key").write_text("of the dataset")
     check_links(snapshot)
+
+
+def test_images_beside_the_data_are_within(root: Path) -> None:
+    for path in ("/etc/passwd", "../x", "images/../../x"):
+        with pytest.raises(DatasetError, match="outside of the dataset"):
+            check_inside(root, root / path)
+    with pytest.raises(DatasetError, match="no file can be called"):
+        check_inside(root, root / "a\0b")
+    assert check_inside(root, root / "images/x.png") == root.resolve() / "images/x.png"
 
 
 @pytest.mark.parametrize("chunks_size", [1, 2, 1000, 5000])
