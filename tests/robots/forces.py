@@ -1,5 +1,7 @@
 """What a simulated arm presses with, and what presses on it."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +39,7 @@ class Wall:
     Args:
         simulation: the arms.
         direction: in which it pushes, world frame, shape (3,) or (n, 3).
-        speed: with which it comes [m/s].
+        speed: with which it comes [m/s], one number or of each arm, as those that follow.
         seconds: for which it comes; then it stays where it is.
         stiffness: of what it is made of [N/m].
 
@@ -45,9 +47,7 @@ class Wall:
         force: with which it pushes each tool now [N], shape (n,).
     """
 
-    def __init__(
-        self, simulation: Simulation, direction: Array, speed: float, seconds: float, stiffness: float = 2e4
-    ) -> None:
+    def __init__(self, simulation: Simulation, direction: Any, speed: Any, seconds: Any, stiffness: Any = 2e4) -> None:
         world, self._hz = simulation.world, simulation.rates.control_hz
         self._direction = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)
         self._speed, self._seconds, self._stiffness = speed, seconds, stiffness
@@ -66,7 +66,7 @@ class Wall:
     def _push(self) -> None:
         self._tick += 1
         time, tool = self._tick / self._hz, self._tool
-        comes = self._speed * min(time, self._seconds) - 0.003
+        comes = self._speed * np.minimum(time, self._seconds) - 0.003
         depth = comes - ((tool - self._start) * self._direction).sum(axis=1)
         speed = self._speed * (time < self._seconds)
         speed = speed - ((tool - self._last) * self._direction).sum(axis=1) * self._hz

@@ -4,6 +4,7 @@ A busy machine alone stops neither robot: what is silent for long is found, what
 """
 
 import json
+import os
 import re
 import signal
 import time
@@ -253,5 +254,14 @@ def _command_line(pid: int) -> str:
 
 def log_of(path: Path, event: str) -> list[dict[str, Any]]:
     """Return the lines of a stand-in's log with this event; its last line may be incomplete."""
-    lines = path.read_text().splitlines(keepends=True)
-    return [line for line in map(json.loads, (one for one in lines if one.endswith("\n"))) if line["event"] == event]
+    with path.open() as file:
+        return [json.loads(line) for line in file if line.endswith("\n") and f'"event": "{event}"' in line]
+
+
+def newest_of(path: Path, event: str) -> dict[str, Any]:
+    """Return the last of these lines, which is looked for at the end of the log."""
+    with path.open("rb") as file:
+        file.seek(-min(path.stat().st_size, 1 << 17), os.SEEK_END)
+        *complete, _ = file.read().decode().split("\n")
+    newest = next(line for line in reversed(complete) if line.startswith(f'{{"event": "{event}"'))
+    return dict(json.loads(newest))

@@ -24,7 +24,7 @@ from bhd_lerobot.bodies.ur import ur5
 from bhd_lerobot.cli import record, train
 from bhd_lerobot.cli.data.main import main as data
 from tests.ros2.peer_env import Peer, environment
-from tests.ros2.programs import Recording, Served, Side, log_of, served
+from tests.ros2.programs import Recording, Served, Side, log_of, newest_of, served
 from tests.waiting import until
 
 IS_FULL = os.environ.get("BHD_TRIALS") == "full"
@@ -142,13 +142,13 @@ def test_whatever_is_killed_the_robot_stands_and_no_saved_episode_is_lost(killed
         Recording("turtlebot3", *DRIVE, "--dataset.num_episodes=9", domain=domain, folder=tmp_path) as recording,
     ):
         recording.wait_for_episode(2)
-        until(lambda: log_of(log, "pose")[-1]["twist"][0] > 0.1, "the robot moves")
+        until(lambda: newest_of(log, "pose")["twist"][0] > 0.1, "the robot moves")
         if killed == "robot":
             robot.signal(signal.SIGKILL)
         else:
             os.kill(recording.pid if part is None else recording.pid_of(part), signal.SIGKILL)
             killed_at = time.monotonic()
-            until(lambda: log_of(log, "pose")[-1]["twist"] == [0.0, 0.0], "the robot stands")
+            until(lambda: newest_of(log, "pose")["twist"] == [0.0, 0.0], "the robot stands")
             assert time.monotonic() - killed_at < 20  # not because the brain was silent for so long
         assert recording.process.wait() != 0
         if part is not None:
@@ -261,9 +261,9 @@ def test_an_arm_that_stops_or_is_left_alone_stands_and_the_episode_names_the_cau
                 os.kill(recording.pid_of(process), signal.SIGKILL)
             assert recording.process.wait() != 0
             assert re.search(cause, recording.text)
-        before = log_of(log, "state")[-1]
-        until(lambda: log_of(log, "state")[-1]["monotonic"] > before["monotonic"] + 0.5, "time passes")
-        assert log_of(log, "state")[-1]["position"] == pytest.approx(before["position"], abs=1e-3)
+        before = newest_of(log, "state")
+        until(lambda: newest_of(log, "state")["monotonic"] > before["monotonic"] + 0.5, "time passes")
+        assert newest_of(log, "state")["position"] == pytest.approx(before["position"], abs=1e-3)
     assert data(["check", str(recording.root)]) == 0
     first, *rest = outcomes_of(recording.root)
     assert first == "timeout"

@@ -167,6 +167,7 @@ def test_what_goes_wrong_ends_the_episode_with_a_fault_that_says_what(tmp_path: 
         assert report.watchdog[0] & Watchdog.PLANT
         assert value <= 3  # fewer where a busy machine skips a frame
         assert host.robot.is_blocked == ("block" in fault)  # nobody waits for a call that blocks
+        host.robot.unblocked.set()
         assert np.isfinite(report.applied).all()
         assert re.search(FAULTS[fault], host.problem), host.problem
         with pytest.raises(RealtimeError, match="in a fault"):
@@ -429,6 +430,9 @@ def test_an_emergency_stop_during_a_long_call_stops_where_the_robot_is_after_it(
         thread.start()
         until(lambda: robot.is_blocked, "the call blocks")
         host.estop()
+        if timeout_s < 1:
+            until(lambda: host.problem, "the call has timed out")
+        robot.unblocked.set()
         until(lambda: len(robot.rows) > 1, "it stops")
         thread.join()
     assert robot.rows == [(0.2, 50.0), (0.0, 30.0)]
@@ -502,6 +506,7 @@ def test_an_action_that_waits_behind_a_blocked_call_is_not_sent_after_the_fault(
         report = host.step(action(50.0))
         host.stop(ONLY)
         assert report.mode[0] == Mode.FAULT
+        host.robot.unblocked.set()
         until(lambda: not host.robot.is_blocked, "the call returns")
         time.sleep(0.3)
     assert {row[0] for row in sent(tmp_path)} == {1.0}

@@ -61,6 +61,14 @@ def run(root: Path, **overrides: object) -> tuple[RecordResult, str]:
     return result, console.file.getvalue()
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a dataset of one episode, which is only read."""
+    root = tmp_path_factory.mktemp("recorded") / "d"
+    run(root, dataset__num_episodes=1)
+    return root
+
+
 def test_requested_and_applied_actions_times_and_images_of_every_device(tmp_path: Path) -> None:
     result, text = run(tmp_path / "d", teleop__amplitude=200, gate__max_change=8)
     assert result.exit_status == 0
@@ -85,10 +93,10 @@ def test_requested_and_applied_actions_times_and_images_of_every_device(tmp_path
     assert "calibration" not in json.dumps(info.recording)
 
 
-def test_stock_lerobot_reads_it_and_it_is_continued(tmp_path: Path) -> None:
+def test_stock_lerobot_reads_it_and_it_is_continued(recorded: Path, tmp_path: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    run(tmp_path / "d", dataset__num_episodes=1)
+    shutil.copytree(recorded, tmp_path / "d")
     result, _ = run(tmp_path / "d", resume="true", robot__port="/dev/other")
     assert result.recorded == 1
     dataset = LeRobotDataset("local/d", root=tmp_path / "d", video_backend="pyav")
@@ -103,8 +111,6 @@ def test_a_processor_stands_between(tmp_path: Path) -> None:
 
 
 FAULTS: dict[str, dict[str, Any]] = {
-    "get_observation raised ConnectionError": {"robot__fault": "disconnect"},
-    "send_action of mock_arm has not returned": {"robot__fault": "send blocks", "gate__call_timeout_s": 0.3},
     "the camera was unplugged": {"robot__cameras": "{front: {type: mock_camera, fail_after: 15}}"},
     "the teleoperator mock_leader failed: ConnectionError": {"teleop__fault": "raises"},
     "The teleoperator gave no 'elbow.pos'": {"teleop__fault": "missing key"},
@@ -195,28 +201,26 @@ def test_a_signal_costs_at_most_the_running_episode(tmp_path: Path, number: sign
     assert math.isfinite(result.wall_s)
 
 
-def test_a_replay_sends_the_recorded_actions_through_the_gate(tmp_path: Path) -> None:
-    run(tmp_path / "d", dataset__num_episodes=1)
-    recorded = np.stack(read_episode(tmp_path / "d", 0)["action"])
+def test_a_replay_sends_the_recorded_actions_through_the_gate(recorded: Path, tmp_path: Path) -> None:
+    actions = np.stack(read_episode(recorded, 0)["action"])
     config = parse(RecordConfig, options(tmp_path / "other", robot__log=tmp_path / "log"))
     console = Console(file=io.StringIO(), width=120)
-    replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=50.0), console)
+    replay_on_robot(recorded, 0, config.robot, GateConfig(max_change=50.0), console)
     sent = np.loadtxt(tmp_path / "log")
-    np.testing.assert_array_equal(sent, recorded)
+    np.testing.assert_array_equal(sent, actions)
     assert "elbow.pos" in console.file.getvalue()
     with pytest.raises(ConfigError, match=r"gate.max_change is not set"):
-        replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(), console)
+        replay_on_robot(recorded, 0, config.robot, GateConfig(), console)
     for change in ({"elbow.pos": 50.0}, {}):
         with pytest.raises(ConfigError, match=r"gate.max_change does not limit shoulder.pos, .*would jump"):
-            replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=change), console)
+            replay_on_robot(recorded, 0, config.robot, GateConfig(max_change=change), console)
     assert len(np.loadtxt(tmp_path / "log")) == len(sent)
 
 
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_a_press_while_a_replay_connects_its_robot_moves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    run(tmp_path / "d", dataset__num_episodes=1)
     connect = MockArm.connect
 
     def pressed(self: MockArm, calibrate: bool = True) -> None:
@@ -228,7 +232,7 @@ def test_a_press_while_a_replay_connects_its_robot_moves_nothing(
         monkeypatch.setattr(MockArm, "connect", pressed)
         robot = parse(RecordConfig, options(tmp_path / "other", robot__log=tmp_path / "log")).robot
         with pytest.raises(RealtimeError, match=f"stopped after .* frames: .*{number.name}"):
-            replay_on_robot(tmp_path / "d", 0, robot, GateConfig(max_change=90.0), Console(file=io.StringIO()))
+            replay_on_robot(recorded, 0, robot, GateConfig(max_change=90.0), Console(file=io.StringIO()))
     finally:
         signal.signal(signal.SIGUSR1, before)
     assert not (tmp_path / "log").exists()
@@ -241,13 +245,14 @@ def rewrite(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path.write_text(json.dumps(info))
 
 
-def test_a_replay_is_by_name_and_in_the_recorded_units_or_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    run(tmp_path / "d", dataset__num_episodes=1)
-    recorded = np.stack(read_episode(tmp_path / "d", 0)["action"])
+def test_a_replay_is_by_name_and_in_the_recorded_units_or_is_refused_before_anything_moves(
+    recorded: Path, tmp_path: Path
+) -> None:
+    actions = np.stack(read_episode(recorded, 0)["action"])
     log, number = tmp_path / "log", iter(range(9))
 
     def replay(change: Callable[[dict[str, Any]], object], **overrides: object) -> str:
-        root = Path(shutil.copytree(tmp_path / "d", tmp_path / f"copy{next(number)}"))
+        root = Path(shutil.copytree(recorded, tmp_path / f"copy{next(number)}"))
         rewrite(root, change)
         robot = parse(RecordConfig, options(tmp_path / "other", robot__log=log, **overrides)).robot
         console = Console(file=io.StringIO(), width=120)
@@ -265,21 +270,20 @@ def test_a_replay_is_by_name_and_in_the_recorded_units_or_is_refused_before_anyt
         replay(lambda features: None, robot__use_degrees="false")
     assert not log.exists()
     dictionary = replay(lambda features: features["action"].update(names={"motors": features["action"]["names"]}))
-    np.testing.assert_array_equal(np.loadtxt(log), recorded)
+    np.testing.assert_array_equal(np.loadtxt(log), actions)
     assert "elbow.pos" in dictionary
     log.unlink()
     assert "nothing is compared" in replay(lambda features: features["observation.state"].update(names=None))
     log.unlink()
     replay(lambda features: [features[key]["names"].reverse() for key in ("action", "observation.state")])
-    np.testing.assert_array_equal(np.loadtxt(log), recorded[:, ::-1])
+    np.testing.assert_array_equal(np.loadtxt(log), actions[:, ::-1])
 
 
 @pytest.mark.thorough(but=1)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_replay_and_lets_go_of_the_robot(
-    tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
+    recorded: Path, tmp_path: Path, number: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run(tmp_path / "d", dataset__num_episodes=1)
     config = parse(RecordConfig, options(tmp_path / "other"))
     ended = []
     send, disconnect = MockArm.send_action, MockArm.disconnect
@@ -298,7 +302,7 @@ def test_a_signal_ends_a_replay_and_lets_go_of_the_robot(
     monkeypatch.setattr(MockArm, "disconnect", let_go)
     console = Console(file=io.StringIO(), width=120)
     with pytest.raises(RealtimeError, match=rf"stopped after \d+ of \d+ frames: {number.name}") as stopped:
-        replay_on_robot(tmp_path / "d", 0, config.robot, GateConfig(max_change=50.0), console)
+        replay_on_robot(recorded, 0, config.robot, GateConfig(max_change=50.0), console)
     assert stopped.value.exit_status == 128 + number
     assert ended
     assert ended[0] < 15

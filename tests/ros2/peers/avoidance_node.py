@@ -46,7 +46,7 @@ class Avoidance:
         self.node = node
         self.publisher = node.create_publisher(Twist, "/cmd_vel", 10)
         node.create_subscription(LaserScan, "/scan", self.on_scan, 10)  # reliable, as in every tutorial
-        node.create_timer(1.0, self.report)
+        node.create_timer(0.1, self.report)
         self.distance = math.nan
         self.scans = self.turning = self.blind = 0
 

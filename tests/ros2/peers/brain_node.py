@@ -26,7 +26,7 @@ parser.add_argument("--name", default="task", help="the goals are called so, and
 parser.add_argument("--frame", default="", help="frame_id of the goals' header")
 parser.add_argument("--max-velocity", type=float, default=0.0)
 parser.add_argument("--patience", type=float, default=60.0, help="the longest wait for a result [s]")
-parser.add_argument("--linger", type=float, default=2.0, help="the wait for results that come twice, at the end [s]")
+parser.add_argument("--linger", type=float, default=0.5, help="the wait for results that come twice, at the end [s]")
 parser.add_argument("--preempt", type=float, help="send the next goal after this time, without waiting [s]")
 parser.add_argument("--burst", type=int, metavar="N", help="send so many goals at once, the given ones in turn")
 parser.add_argument("--depth", type=int, default=10, help="of the queues of goals and results")

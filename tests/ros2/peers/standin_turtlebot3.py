@@ -102,7 +102,7 @@ class Robot:
             )
         main.create_subscription(TwistStamped, "/cmd_vel", self.on_command, 10)
         main.create_timer(STEP, self.advance)
-        main.create_timer(1.0, self.report)
+        main.create_timer(0.1, self.report)
 
     def outlet(self, node: Node, topic: str, kind: type, **options: Any) -> Outlet:
         outlet = Outlet(args, lambda: self.elapsed, node, f"/{topic}", kind, **options)

@@ -106,7 +106,7 @@ def list_all(node: Node) -> Callable[[], None]:
         nodes = sorted(f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
         peer.log("list", nodes=nodes, topics=dict(node.get_topic_names_and_types()))
 
-    node.create_timer(1.0, show)
+    node.create_timer(0.2, show)
     return lambda: None
 
 

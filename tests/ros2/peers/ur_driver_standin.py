@@ -84,7 +84,7 @@ class Arm:
         signal.signal(signal.SIGUSR1, self.on_usr1)
         states.create_timer(1 / args.hz, self.advance)
         speed.create_timer(1 / STATE_HZ, lambda: self.speed.publish(Float64(data=self.scaling)))
-        states.create_timer(1.0, self.report)
+        states.create_timer(0.1, self.report)
 
     def elapsed(self) -> float:
         """Time since the start [s]."""

@@ -18,10 +18,9 @@ from bhd_lerobot.control.messages import Mode
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.datasets.format.columns import read_episode
 from bhd_lerobot.datasets.format.summary import dataset_info
-from bhd_lerobot.ros2.live.network import NetworkConfig
-from bhd_lerobot.ros2.live.node import Node
+from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC
 from tests.ros2.peer_env import Peer
-from tests.ros2.programs import Program, Side, log_of
+from tests.ros2.programs import Program, log_of, newest_of
 from tests.ros2.serve.bridges import NEAR, STAND, TWIST, arm, base, drives, twist
 from tests.waiting import until
 
@@ -75,13 +74,17 @@ def test_twists_are_an_episode_until_they_cease_and_after_a_stop_and_at_the_end_
     assert first[keys.OBSERVATION_STATE][[0, -1], 0] == pytest.approx([0, 0], abs=0.02)
     assert (np.diff(first[keys.TIME]) > 0).all()
     assert stopped[keys.MODE].tolist().count(Mode.ESTOP) == 1
-    # The dataset is continued by the same robot, and by no other one.
+    # The dataset is continued by the same robot, and by no other one; a kill costs the running episode alone.
     number = len(ended)
     with base(domain, tmp_path, *options(root, episode_time_s=1)) as (side, _, log):
         side.served.wait_for(f"Recording into {root}, from episode {number} on")
         last = f"Episode {number + 1} is saved"
         until(lambda: drives(side, log) and last in side.served.text, "its time is over, twice")
-        assert side.served.stop() == 0
+        until(lambda: drives(side, log), "it drives on")
+        os.kill(side.served.pid, signal.SIGKILL)
+        side.served.process.wait()
+        until(lambda: twist(log) == STAND, "it stands")
+    assert data.main(["repair", str(root)]) == 0
     assert once(episodes(root)[number:]) == [("timeout", False)]
     summary = dataset_info(root)
     assert max(episode.frames for episode in summary.episodes[number:]) == summary.fps
@@ -96,21 +99,19 @@ def of(robot: str, domain: int, *options: str) -> list[str]:
 
 def test_goals_of_an_arm_are_episodes_with_the_outcome_of_their_results(domain: int, tmp_path: Path) -> None:
     root = tmp_path / "goals"
-    with arm(domain, tmp_path, *options(root)) as (bridge, _, log):
+    with arm(domain, tmp_path, *options(root)) as (side, _, log):
         with Peer("brain_node.py", "--name=test_move", *NEAR, domain=domain) as brain:
             assert brain.wait_event("summary")["once"] == 2
             succeeded = [line["success"] for line in brain.events("result")]  # not always, beside other programs
-        bridge.wait_for("Episode 1 is saved")
-        with Node("brain", NetworkConfig(domain=domain)) as node:
-            side = Side(bridge, node)
-            pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0}}
-            goal = {"task_id": "cut", "target_pose": pose, "max_velocity": 0.05}  # it takes long
-            side.send("/brain/command", "bhd_interfaces/msg/BrainCommand", goal)
-            side.wait(lambda state: state.is_moving, "it moves")
-            here = [*log_of(log, "state")[-1]["position"], 0.0]
-            side.send("/brain/commands", "std_msgs/msg/Float64MultiArray", {"data": np.array([here])})
-            bridge.wait_for("Episode 3 is saved: timeout")
-        assert bridge.stop() == 0
+        side.served.wait_for("Episode 1 is saved")
+        pose = {"position": {"x": 0.5, "y": 0.1, "z": 0.4}, "orientation": {"y": 1.0}}
+        goal = {"task_id": "cut", "target_pose": pose, "max_velocity": 0.05}  # it takes long
+        side.send(COMMAND_TOPIC, COMMAND, goal)
+        side.wait(lambda state: state.is_moving, "it moves")
+        here = [*newest_of(log, "state")["position"], 0.0]
+        side.send("/brain/commands", "std_msgs/msg/Float64MultiArray", {"data": np.array([here])})
+        side.served.wait_for("Episode 3 is saved: timeout")
+        assert side.served.stop() == 0
     ended = [("success", True) if one else ("failure", False) for one in succeeded]
     assert episodes(root) == [*ended, ("failure", False), ("timeout", False)]
     summary = dataset_info(root)
@@ -126,6 +127,7 @@ def test_goals_of_an_arm_are_episodes_with_the_outcome_of_their_results(domain: 
 
 
 def test_a_fault_is_an_episode_s_end_and_recording_goes_on_after_the_reset(domain: int, tmp_path: Path) -> None:
+    """Also one that ends the bridge: its loop is killed."""
     root = tmp_path / "faults"
     with base(domain, tmp_path, *options(root), silence_s=0.5) as (side, robot, log):
         until(lambda: drives(side, log), "it drives")
@@ -139,31 +141,11 @@ def test_a_fault_is_an_episode_s_end_and_recording_goes_on_after_the_reset(domai
 
             until(lambda: (tmp_path / "second").is_file() and log_of(tmp_path / "second", "pose"), "it is back")
             until(goes_on, "it drives again")
-            assert side.served.stop() == 0
-    assert episodes(root)[0] == ("fault", False)
-    assert len(episodes(root)) > 1
-
-
-def test_a_kill_costs_the_running_episode_alone(domain: int, tmp_path: Path) -> None:
-    root = tmp_path / "killed"
-    with base(domain, tmp_path, *options(root)) as (side, _, log):
-        until(lambda: drives(side, log), "it drives")
-        side.served.wait_for("Episode 0 is saved: timeout")
-        until(lambda: drives(side, log), "it drives again")
-        os.kill(side.served.pid, signal.SIGKILL)
-        side.served.process.wait()
-        until(lambda: twist(log) == STAND, "it stands")
-    assert data.main(["repair", str(root)]) == 0
-    assert once(episodes(root)) == [("timeout", False)]
-
-
-def test_the_episode_of_a_robot_whose_loop_is_killed_is_a_fault(domain: int, tmp_path: Path) -> None:
-    root = tmp_path / "lost"
-    with base(domain, tmp_path, *options(root)) as (side, _, log):
-        until(lambda: drives(side, log), "it drives")
-        os.kill(side.served.pid_of("robots.host.process"), signal.SIGKILL)
-        assert side.served.process.wait() == 2
-    assert episodes(root)[-1] == ("fault", False)
+            os.kill(side.served.pid_of("robots.host.process"), signal.SIGKILL)
+            assert side.served.process.wait() == 2
+            until(lambda: twist(tmp_path / "second") == STAND, "it stands")
+    first, *_, last = episodes(root)
+    assert first == last == ("fault", False)
 
 
 def test_a_disk_that_is_full_ends_the_recording_and_not_the_bridge(domain: int, tmp_path: Path) -> None:

@@ -20,9 +20,10 @@ from bhd_lerobot.ros2.messages.views import CAMERA_INFO
 from bhd_lerobot.ros2.serve.interface import COMMAND, COMMAND_TOPIC, ESTOP_TOPIC
 from tests.ros2.peer_env import Peer
 from tests.ros2.programs import BOOL, Served, Side, put, served
+from tests.ros2.serve.bridges import burst
 from tests.waiting import until
 
-TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+STAMPED = "geometry_msgs/msg/TwistStamped"
 STRING = "std_msgs/msg/String"
 FORWARD = {"linear": {"x": 0.1}}
 JOINTS = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
@@ -81,6 +82,11 @@ def test_each_goal_of_a_flood_has_one_result_and_the_stop_is_not_behind_it(base:
     names = [one.task_id for one in base.ended(3000 - before)]
     assert len(set(names)) == len(names) == 3000 - before
     base.reset()
+
+
+def test_each_goal_of_a_burst_has_one_result(base: Side, arm: Side) -> None:
+    for side, robot in ((base, "turtlebot3"), (arm, "ur5")):
+        burst(side, robot)
 
 
 def test_the_result_of_a_stopped_robot_names_the_topic_that_resets_it(arm: Side) -> None:

@@ -127,7 +127,7 @@ class MockArm(Robot):
         self._position = dict.fromkeys(JOINTS, 0.0)
         self._is_connected = False
         self.observed = self.sent = 0
-        self.is_blocked = False
+        self.is_blocked, self.unblocked = False, threading.Event()
         self._times: list[int] = []
 
     @property
@@ -195,7 +195,7 @@ class MockArm(Robot):
 
     def _block(self) -> None:
         self.is_blocked = True
-        time.sleep(2.0)
+        self.unblocked.wait(60)
         self.is_blocked = False
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from tests.waiting import until
 
 TEXT, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 START, STEP = 1_700_000_000 * 10**9, 20_000_000
-COUNT = 60
+COUNT = 30
 TOPICS = {
     "/words": profile(10),
     "/robot1/fast": profile(5, reliable=False),
@@ -119,7 +119,9 @@ def play(*arguments: str, output: Path) -> Fork:
 
 def test_a_late_start_begins_with_what_was_latched_before(listener: Any, domain: int, tmp_path: Path) -> None:
     bag = write(tmp_path / "bag")
-    fork = play(str(bag), f"--domain={domain}", "--start=0.59", output=tmp_path / "printed")
+    fork = play(
+        str(bag), f"--domain={domain}", f"--start={(COUNT / 2 - 0.5) * STEP / 1e9}", output=tmp_path / "printed"
+    )
     assert fork.wait() == 0
     found: list[int] = []
     until(lambda: found.extend(numbers(listener, "/words")) or len(found) >= COUNT // 2, "all messages")
@@ -178,7 +180,7 @@ def test_a_player_that_was_stopped_goes_on_at_its_pace(listener: Any, domain: in
     found: list[Any] = []
     until(lambda: found.extend(listener["/words"].take()) or len(found) > 5, "some messages")
     fork.send_signal(signal.SIGSTOP)
-    time.sleep(1.0)
+    time.sleep(0.5)
     fork.send_signal(signal.SIGCONT)
     until(lambda: found.extend(listener["/words"].take()) or len(found) == COUNT, "all messages")
     assert fork.wait() == 0
