@@ -125,8 +125,8 @@ def check_source(
 
 
 KILLED = {  # a part of its command line, None for bhd-record itself; what is said of it
-    "robot": ("", r"/\w+ has sent no message for|The wheels read"),  # whichever is noticed first
     "recording": (None, ""),
+    "robot": ("", r"/\w+ has sent no message for|The wheels read"),  # whichever is noticed first
     "cerebellum": ("robots.host.process", "The cerebellum's process was killed by signal 9"),
     "node": ("ros2.live.process node", "The process of the ROS 2 node ended with status -9"),
 }

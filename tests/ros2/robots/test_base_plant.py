@@ -156,7 +156,7 @@ def test_another_robot_of_its_name_another_node_that_commands_it_and_a_guard_tha
 
 
 def test_a_silent_topic_and_a_robot_that_is_gone_are_named(domain: int) -> None:
-    plant = make(domain, silence_s=2.0)
+    plant = make(domain, silence_s=1.0)
     with Peer("standin_turtlebot3.py", "--silence=scan", domain=domain) as robot:
         robot.wait_event("ready")
         try:
@@ -170,20 +170,24 @@ def test_a_silent_topic_and_a_robot_that_is_gone_are_named(domain: int) -> None:
             plant.close()
 
 
-@pytest.mark.parametrize("fault", ["--zero-stamp=all", "--clock-offset=86400"])
-def test_stamps_of_zero_and_of_tomorrow_are_of_another_clock_and_nan_is_read_as_it_is(fault: str, domain: int) -> None:
+def test_stamps_of_zero_and_of_tomorrow_are_of_another_clock_and_nan_is_read_as_it_is(domain: int) -> None:
     """The check of all readings above the plants finds what is no number."""
     out = PlantReading(1, 2, 360)
     out.stamp_ns = np.zeros(1, np.int64)
+    stamps, values = (
+        ("--zero-stamp=joint_states", "--clock-offset=86400"),
+        ("--nan=joint_states:0:999", "--nan=scan:0:999"),
+    )
     with (
-        Peer("standin_turtlebot3.py", fault, "--nan=joint_states:0:999", "--nan=scan:0:999", domain=domain),
+        Peer("standin_turtlebot3.py", *stamps, *values, domain=domain),
         closing(make(domain, imu=False, silence_s=1.0)) as plant,
     ):
         plant.open()
         before = int(plant.state()["count"][0])
         until(lambda: plant.state()["count"][0] > before + 5, "five more joint states")
         plant.read(out)
-        assert 0 < plant.state()["arrived_ns"][0] - out.stamp_ns[0] + 1 < 1e9
+        for arrived_ns, stamp_ns in zip(plant.state()["arrived_ns"], (out.stamp_ns[0], out.sensors_ns[0]), strict=True):
+            assert 0 < arrived_ns - stamp_ns + 1 < 1e9
         assert np.isnan(out.position).all()
         np.testing.assert_array_equal(out.sensors, 3.5)  # a reading that is none is no return
 
@@ -246,8 +250,12 @@ def test_a_flood_is_read(domain: int) -> None:
 def test_a_network_with_nobody_is_named(domain: int, capsys: pytest.CaptureFixture[str]) -> None:
     plant = make(domain)
     where = rf"Nobody publishes /joint_states .* in ROS domain {domain} on 'lo'\..*No node publishes anything.*domain"
-    with pytest.raises(RealtimeError, match=where):
-        plant.link.open(patience_s=8.0)
+    for patience_s in (3.0, 10.0, 30.0):  # a node on a busy machine may not have looked around yet
+        with pytest.raises(RealtimeError) as failed:
+            plant.link.open(patience_s)
+        if re.search(where, str(failed.value)):
+            break
+    assert re.search(where, str(failed.value))
     plant.close()
     assert "Waiting for the robot, " in capsys.readouterr().err
 

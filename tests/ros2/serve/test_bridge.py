@@ -147,11 +147,12 @@ def test_a_goal_in_odom_is_driven_to_by_the_robots_own_odometry(shared_base: Bri
 
 def test_what_commands_a_robot_twice_is_named(shared_base: Bridge, tmp_path: Path) -> None:
     side, _, log = shared_base
-    domain = f"--robot.ros2.domain={domain_of(side)}"
-    second = ["bridge", "--robot.type=turtlebot3", "--robot.plant=ros2", domain]
-    with Program(serve.main, second, log=tmp_path / "second") as bridge:
+    second = ["bridge", "--robot.type=turtlebot3", "--robot.plant=ros2", f"--robot.ros2.domain={domain_of(side)}"]
+    recording = [f"--record.root={tmp_path / 'none'}", "--record.task=drive"]
+    with Program(serve.main, [*second, *recording], log=tmp_path / "second") as bridge:
         assert bridge.process.wait() == 2
         assert "commands /cmd_vel in ROS domain" in bridge.text
+    assert not (tmp_path / "none").exists()
     until(lambda: drives(side, log), "the first drives")
     with Peer("topic.py", "pub", "/brain/cmd_vel", TWIST, domain=domain_of(side)):
         side.served.wait_for("/brain/cmd_vel has 2 publishers, brain and topic_pub: the newest message counts")

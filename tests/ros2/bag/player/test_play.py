@@ -93,8 +93,10 @@ def test_a_real_node_receives_what_a_killed_recording_holds(domain: int, tmp_pat
     file.write_bytes(file.read_bytes()[:-300])  # without its end
     with Peer("topic.py", "echo", "/words", TEXT, domain=domain) as peer:
         peer.wait_event("ready")
-        with Fork(main, ["play", str(bag), f"--domain={domain}", "--topics", "words", "--loop", "--wait=60"]):
-            until(lambda: len(peer.events("message")) >= 2 * COUNT, "all messages come")
+        fork = Fork(main, ["play", str(bag), f"--domain={domain}", "--topics", "words", "--loop", "--wait=60"])
+        until(lambda: len(peer.events("message")) >= 2 * COUNT, "all messages come")
+        fork.send_signal(signal.SIGINT)
+        assert fork.wait() == 0
         numbers = [int(line["message"]["data"]) for line in peer.events("message")]
     assert numbers == [number % COUNT for number in range(numbers[0], numbers[0] + len(numbers))]
 
@@ -180,7 +182,7 @@ def test_a_player_that_was_stopped_goes_on_at_its_pace(listener: Any, domain: in
     found: list[Any] = []
     until(lambda: found.extend(listener["/words"].take()) or len(found) > 5, "some messages")
     fork.send_signal(signal.SIGSTOP)
-    time.sleep(0.5)
+    time.sleep(1.0)  # after a shorter one it catches up
     fork.send_signal(signal.SIGCONT)
     until(lambda: found.extend(listener["/words"].take()) or len(found) == COUNT, "all messages")
     assert fork.wait() == 0

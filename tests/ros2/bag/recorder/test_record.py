@@ -7,9 +7,8 @@ import shutil
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from mcap.reader import make_reader
@@ -25,7 +24,7 @@ from bhd_lerobot.ros2.live.network import LATCHED, SENSOR_DATA, NetworkConfig, Q
 from bhd_lerobot.ros2.live.node import Node
 from bhd_lerobot.ros2.messages.serialize import decode, encode_one
 from tests.forks import Fork
-from tests.ros2.peer_env import Peer
+from tests.ros2.peer_env import Peer, free_domain
 from tests.waiting import until
 
 TEXT, NUMBER = "std_msgs/msg/String", "std_msgs/msg/Int64"
@@ -91,31 +90,57 @@ def check(read: Read) -> None:
         assert times == sorted(times)
 
 
-@contextlib.contextmanager
-def recorded(domain: int, tmp_path: Path, *arguments: str) -> Iterator[tuple[Fork, Path]]:
-    """Record what `bag_source.py` sends, until all of it can be read."""
-    bag, printed, heard = (tmp_path / name for name in ("bag", "printed", "heard"))
-    with (
-        Fork(main, ["record", f"--output={bag}", f"--domain={domain}", *arguments], output=printed) as fork,
-        Peer("bag_source.py", f"--count={COUNT}", f"--heard={heard}", domain=domain) as peer,
-    ):
-        peer.wait_event("ready")
-        until(lambda: all(counts(bag).get(topic) for topic in (*RELIABLE, "/mixed", "/fast")), "all are heard")
-        heard.touch()
-        peer.wait_event("sent")
-        until(lambda: all(last_of(bag, topic) == COUNT - 1 for topic in RELIABLE), "everything is in the bag")
-        yield fork, bag
+class Recorded(NamedTuple):
+    """What a recorder of the real nodes left behind."""
+
+    bag: Path
+    printed: str
+    status: int
+
+
+NAMED = ("words", "robot1/arm/words", "robot1/stamped", "/nested", "/mixed", "/fast", "/absent")
+RECORDERS = {  # its arguments, and what ends it
+    "mcap": (("--all", "--storage=mcap", "--exclude=/rosout|/parameter.*"), signal.SIGINT),
+    "sqlite3": (("--all", "--storage=sqlite3", "--exclude=/rosout|/parameter.*"), signal.SIGINT),
+    "killed mcap": (("--all", "--storage=mcap"), signal.SIGKILL),
+    "killed sqlite3": (("--all", "--storage=sqlite3"), signal.SIGKILL),
+    "named": ((*NAMED, "--wait=0.1"), signal.SIGTERM),
+}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Recorded]:
+    """Record what `bag_source.py` sends by several recorders at a time, until all of it can be read."""
+    folder, forks = tmp_path_factory.mktemp("recorded"), {}
+    heard, bags = folder / "heard", [folder / name for name in RECORDERS]
+    with contextlib.ExitStack() as running, free_domain() as domain:
+        for name, (arguments, _) in RECORDERS.items():
+            given = ["record", f"--output={folder / name}", f"--domain={domain}", *arguments]
+            forks[name] = running.enter_context(Fork(main, given, output=folder / f"{name} printed"))
+        with Peer("bag_source.py", f"--count={COUNT}", f"--heard={heard}", domain=domain) as peer:
+            peer.wait_event("ready")
+            for bag in bags:
+                until(lambda bag=bag: all(counts(bag).get(one) for one in (*RELIABLE, "/mixed", "/fast")), "all come")
+            heard.touch()
+            peer.wait_event("sent")
+            for bag in bags:
+                until(lambda bag=bag: all(last_of(bag, topic) == COUNT - 1 for topic in RELIABLE), "all is in the bag")
+        for name, (_, number) in RECORDERS.items():
+            forks[name].send_signal(number)
+            forks[name].wait()
+    return {
+        name: Recorded(folder / name, (folder / f"{name} printed").read_text(), fork.wait())
+        for name, fork in forks.items()
+    }
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-def test_what_real_nodes_send_is_in_the_bag_with_their_quality_of_service(storage, domain, tmp_path):
-    with recorded(domain, tmp_path, "--all", f"--storage={storage}", "--exclude=/rosout|/parameter.*") as (fork, bag):
-        fork.send_signal(signal.SIGINT)
-        assert fork.wait() == 0
+def test_what_real_nodes_send_is_in_the_bag_with_their_quality_of_service(storage, recorded):
+    bag, printed, status = recorded[storage]
+    assert status == 0
     read = by_rosbags(bag)
     check(read)
     assert "/rosout" not in read
-    printed = (tmp_path / "printed").read_text()
     assert re.search(rf"^/robot1/arm/words +{len(read['/robot1/arm/words'])}  {TEXT}$", printed, re.MULTILINE)
     assert " messages in " in printed.splitlines()[-1]
     with Reader(bag) as reader:
@@ -128,15 +153,14 @@ def test_what_real_nodes_send_is_in_the_bag_with_their_quality_of_service(storag
     assert offered["/fast"] == [("BEST_EFFORT", "VOLATILE")]
     assert sorted(offered["/mixed"]) == [("BEST_EFFORT", "VOLATILE"), ("RELIABLE", "TRANSIENT_LOCAL")]
     if storage == "mcap":
-        raw = by_mcap(bag / "bag.mcap")
+        raw = by_mcap(bag / f"{bag.name}.mcap")
         assert {topic: len(messages) for topic, messages in raw.items()} == {one: len(read[one]) for one in raw}
 
 
 @pytest.mark.parametrize("storage", ENDINGS)
-def test_what_was_recorded_before_a_kill_can_be_read_with_metadata_and_without(storage, domain, tmp_path):
-    with recorded(domain, tmp_path, "--all", f"--storage={storage}") as (fork, bag):
-        fork.kill()
-    file = bag / f"bag.{ENDINGS[storage]}"
+def test_what_was_recorded_before_a_kill_can_be_read_with_metadata_and_without(storage, recorded):
+    bag, _, _ = recorded[f"killed {storage}"]
+    file = bag / f"{bag.name}.{ENDINGS[storage]}"
     check(by_rosbags(bag))
     check(by_rosbags(file))
     sizes = {topic: len(messages) for topic, messages in by_rosbags(file).items()}
@@ -149,13 +173,11 @@ def test_what_was_recorded_before_a_kill_can_be_read_with_metadata_and_without(s
         (bag / "metadata.yaml").unlink(missing_ok=True)
 
 
-def test_sigterm_ends_a_recording_of_named_topics_as_ctrl_c_does(domain: int, tmp_path: Path) -> None:
-    named = ["words", "robot1/arm/words", "robot1/stamped", "/nested", "/mixed", "/fast", "/absent"]
-    with recorded(domain, tmp_path, *named, "--wait=0.1") as (fork, bag):
-        fork.send_signal(signal.SIGTERM)
-        assert fork.wait() == 0
+def test_sigterm_ends_a_recording_of_named_topics_as_ctrl_c_does(recorded: dict[str, Recorded]) -> None:
+    bag, printed, status = recorded["named"]
+    assert status == 0
     assert set(by_rosbags(bag)) == {*RELIABLE, "/mixed", "/fast"}
-    assert "Nobody publishes /absent, after 0.1 s; it is waited for." in (tmp_path / "printed").read_text()
+    assert "Nobody publishes /absent, after 0.1 s; it is waited for." in printed
 
 
 def message(msgtype: str, number: int) -> bytes:
