@@ -22,11 +22,13 @@ BURSTS = {  # one goal that can be followed and one that cannot; why others than
 
 
 @contextmanager
-def base(domain: int, folder: Path, *options: str, **settings: Any) -> Iterator[tuple[Side, Peer, Path]]:
-    """A TurtleBot3 on a large open floor, its bridge, and a brain's node."""
+def base(
+    domain: int, folder: Path, *options: str, half: float = 2.0, **settings: Any
+) -> Iterator[tuple[Side, Peer, Path]]:
+    """A TurtleBot3 on an open floor, half of its width in metres, its bridge, and a brain's node."""
     log = folder / "robot.jsonl"
     with (
-        Peer("standin_turtlebot3.py", "--open", "--half=50", "--log", log, domain=domain) as robot,
+        Peer("standin_turtlebot3.py", "--open", f"--half={half}", "--log", log, domain=domain) as robot,
         Bridged("turtlebot3", *options, domain=domain, log=folder / "log", **settings) as bridge,
         Node("brain", NetworkConfig(domain=domain)) as node,
     ):

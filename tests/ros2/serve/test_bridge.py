@@ -30,7 +30,7 @@ type Bridge = tuple[Side, Peer, Path]
 
 @pytest.fixture(scope="module")
 def shared_base(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bridge]:
-    with free_domain() as domain, base(domain, tmp_path_factory.mktemp("base")) as bridge:
+    with free_domain() as domain, base(domain, tmp_path_factory.mktemp("base"), half=50) as bridge:
         yield bridge
 
 
