@@ -26,7 +26,7 @@ from tests.waiting import until
 STAMPED = "geometry_msgs/msg/TwistStamped"
 STRING = "std_msgs/msg/String"
 FORWARD = {"linear": {"x": 0.1}}
-FLOOD = 3000  # goals, more than the robot takes while they are sent
+FLOOD = 1000  # goals, more than the robot takes while they are sent
 JOINTS = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
 
 
