@@ -102,7 +102,7 @@ def test_what_cannot_be_called_is_named(node: Node, servers: Peer) -> None:
 
 
 def test_no_reply_in_time_is_an_error_and_an_idempotent_request_is_sent_again(domain: int, other: Node) -> None:
-    with Peer("servers.py", "--busy", 1.2, domain=domain) as peer:
+    with Peer("servers.py", "--busy", 2, domain=domain) as peer:
         client = ServiceClient(other, "/motor_power", SET_BOOL)
         client.wait_for_server(60)
         with pytest.raises(RealtimeError, match=r"has not replied within 0.3 s. The request may have been carried out"):
