@@ -31,6 +31,10 @@ def test_a_shells_domain_that_is_none_is_named_when_it_is_used(monkeypatch: pyte
     [
         ({"interface": "eth0 <"}, "neither a network interface nor an address"),
         ({"peers": ["a b"]}, "neither a network interface nor an address"),
+        ({"latency_s": -0.1}, "latency_s"),
+        ({"latency_s": 3.0}, "latency_s"),
+        ({"scan_yaw": float("nan")}, "scan_yaw"),
+        ({"silence_s": 0.0}, "silence_s"),
     ],
 )
 def test_what_cannot_be_is_refused(options: dict[str, object], text: str) -> None:

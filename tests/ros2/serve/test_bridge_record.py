@@ -163,15 +163,6 @@ def test_a_disk_that_is_full_ends_the_recording_and_not_the_bridge(domain: int, 
     assert once(episodes(root)) == [("timeout", False)]
 
 
-@pytest.mark.thorough
-def test_a_robot_that_is_not_there_is_named_and_leaves_no_dataset(domain: int, tmp_path: Path) -> None:
-    root = tmp_path / "none"
-    with Program(serve.main, of("ur5", domain, *options(root)), log=tmp_path / "log") as bridge:
-        assert bridge.process.wait() == 2
-        assert "/joint_states" in bridge.text
-    assert not root.exists()
-
-
 @pytest.mark.parametrize(
     ("given", "error"),
     [
