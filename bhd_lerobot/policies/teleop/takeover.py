@@ -1,7 +1,7 @@
 """A brain from which a person takes over, and to which they give back."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,8 +86,10 @@ class TakeoverBrain(Brain):
         command = self._brain.act(observation)
         if isinstance(command, Chunk):
             self._left = list(command.actions)
+        elif command is None:
+            self._left = self._left[1:] or self._left
         else:
-            self._left = (self._left[1:] or self._left) if command is None else [cast(Any, command)]
+            self._left = [command] if isinstance(command, np.ndarray) else []
         return command
 
     def subtasks(self) -> Sequence[str]:

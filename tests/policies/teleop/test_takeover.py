@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bhd_lerobot.control.commands import Chunk
+from bhd_lerobot.control.commands import Chunk, Goals
 from bhd_lerobot.datasets.format import features as keys
 from bhd_lerobot.errors import ConfigError
 from bhd_lerobot.policies.brain import Brain, Observation, RobotFeatures
@@ -112,6 +112,19 @@ def test_who_takes_over_and_does_nothing_yet_ends_what_a_chunk_would_go_on_with(
     assert given == [None, None, 2.0, None, 103.0, 104.0, None, None]
     assert [isinstance(one, Chunk) for one in commands] == [True] + [False] * 5 + [True, False]
     assert person.held == [2.0]
+
+
+def test_of_a_brain_that_gives_goals_nothing_is_held() -> None:
+    class Asking(Counting):
+        def act(self, observation: Observation) -> Any:
+            return Goals({})
+
+    person, frames = Counting("teleop", 100.0), iter(range(99))
+    both: Any = TakeoverBrain(Asking("plugin", 0.0), person, lambda: next(frames) > 0)  # type: ignore[arg-type]
+    both.bind(RobotFeatures(("a.pos",), ("a.pos",), 10))
+    both.reset(np.zeros(1, np.intp), [0], 1)
+    assert [type(both.act(SEEN)) for _ in range(2)] == [Goals, np.ndarray]
+    assert person.held == [None]
 
 
 @pytest.mark.law
