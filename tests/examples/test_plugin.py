@@ -12,7 +12,8 @@ from bhd_lerobot.apps.view.packing import unpack
 from bhd_lerobot.cli import evaluate, record
 from bhd_lerobot.cli.data import main as data
 from bhd_lerobot.options.parse import parse
-from bhd_lerobot.rollout import replay
+from bhd_lerobot.rollout.replay.config import ReplayConfig
+from bhd_lerobot.rollout.replay.simulated import replay
 from tests.forks import Fork
 from tests.wheels import wheel_of
 
@@ -28,7 +29,7 @@ def use(folder: Path) -> int:
     options = [*recorded, f"--output_dir={folder / 'run'}", "--n_envs=3", "--preview_video=false"]
     assert record.main([*chosen, "--brain.type=wall_follower", *options]) == 0
     again = [f"--dataset.root={folder / 'd'}", "--dataset.episode=1", f"--output_dir={folder / 'replay'}"]
-    replayed = replay.replay(parse(replay.ReplayConfig, again))
+    replayed = replay(parse(ReplayConfig, again))
     assert replayed
     assert all(one.identical for one in replayed)
     brains = ["--brains.mine.type=wall_follower", "--brains.gaps.type=gap_follower"]
