@@ -92,7 +92,8 @@ def run_beside(folder: Path, name: str, version: str, program: str, *arguments: 
 def test_every_command_that_simulates_ends_in_one_sentence_beside_another_mujoco(tmp_path: Path) -> None:
     avoid = "--robot.type=turtlebot3 --task.type=avoid --brain.type=avoidance"
     record, evaluate = f"record {avoid} --dataset.root={tmp_path}/d", f"evaluate {avoid} --output_dir={tmp_path}/e"
-    done = run_beside(tmp_path, "mujoco", "3.8.1", COMMANDS, record, "train", evaluate, "replay", "data", "monitor")
+    replay = f"replay --dataset.root={tmp_path}/d"
+    done = run_beside(tmp_path, "mujoco", "3.8.1", COMMANDS, record, "train", evaluate, replay, "data", "monitor")
     assert "Traceback" not in done.stderr
     refused = [line for line in done.stderr.splitlines() if line]
     assert len(refused) == 3  # a training looks at data alone, unless it evaluates
