@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bhd_lerobot.bodies.body import Body, Drive, LidarSpec
+from bhd_lerobot.control.messages import NANOSECONDS
 from bhd_lerobot.control.plant import PlantReading
 from bhd_lerobot.errors import RealtimeError
 from bhd_lerobot.ros2.live.network import SENSOR_DATA
@@ -27,7 +28,6 @@ _STOP = (0.0, 0.0)
 _NODE_SILENCE_S = 0.5  # of topics at 20 Hz
 _SCAN_SILENCE_S = 1.0  # of scans at 5 Hz
 _FASTER = 2.0  # times the wheels' largest speed, which none is
-_STEP = 0.5  # [rad] that a wheel may have turned beside that: two readings are not exactly as far apart as their stamps
 
 
 class BasePlant(Ros2Plant):
@@ -95,14 +95,16 @@ class BasePlant(Ros2Plant):
         out.sensors_ns[0] = measured[1:].min()
 
     def _turned(self, angles: NDArray[np.float64], measured_ns: int) -> NDArray[np.float64]:
-        """Return how far the wheels have turned [rad], shape (2,), also after their driver began to count anew.
+        """Return how far the wheels have turned [rad], shape (2,), also after a new start of their driver.
 
-        What they turned in between is not known, and left out.
+        After a silence, which stopped the robot, a count that no wheel can have reached is one from 0; what they
+        turned meanwhile is not known. Without a silence it is a false reading, and is passed on to the check of readings.
         """
         if self._wheels is None:
             self._wheels, self._read_ns = angles.copy(), measured_ns
-        step, elapsed_s = angles - self._wheels, (measured_ns - self._read_ns) / 1e9
-        if np.abs(step).max() > self._fastest * np.clip(elapsed_s, 0.0, self._longest_s) + _STEP:
+        step = angles - self._wheels
+        was_silent = measured_ns - self._read_ns > self._longest_s * NANOSECONDS
+        if was_silent and np.abs(step).max() > self._fastest * self._longest_s:
             self._counted_before -= step
         self._wheels, self._read_ns = angles.copy(), measured_ns
         return angles + self._counted_before

@@ -13,6 +13,13 @@ from tests.datasets import foreign, support
 from tests.recording.support import run_record
 
 
+def test_each_command_is_found_in_the_module_that_has_it(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in main.MODULES:
+        with pytest.raises(SystemExit) as end:
+            main.main([command, "--help"])
+        assert (end.value.code, capsys.readouterr().out.split()[:3]) == (0, ["usage:", "bhd-data", command])
+
+
 def test_info_shows_outcome_and_timing_of_every_episode(drives, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
     assert main.main(["info", str(drives)]) == 0
