@@ -45,12 +45,13 @@ def leaving_on_interrupt() -> Iterator[None]:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Show at once in a terminal that the command has begun, until it has loaded what it needs."""
+    """Load what a command needs: a terminal shows that it has begun, and Ctrl-C ends it, see `leaving_on_interrupt`."""
     is_shown = sys.stderr is not None and sys.stderr.isatty()
     if is_shown:
         print("Loading…", end="\r", file=sys.stderr, flush=True)
     try:
-        yield
+        with leaving_on_interrupt():
+            yield
     finally:
         if is_shown:
             print("\x1b[K", end="", file=sys.stderr, flush=True)
@@ -76,7 +77,7 @@ def run(module: str) -> int:
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1, signal.SIGUSR2])
 
     def program() -> int | None:
-        with leaving_on_interrupt(), loading():
+        with loading():
             if module not in _WITHOUT_LEROBOT:
                 check_version("lerobot")
                 defer_packages()

@@ -42,11 +42,14 @@ INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
     [
         f"try:\n    {INTERRUPT.replace(chr(10), chr(10) + '    ')}pass\nexcept BaseException:\n    pass\n",
         f"{INTERRUPT}raise AssertionError('it went on')\n",
+        f"def main():\n    with s.loading():\n        exec({INTERRUPT!r} + 'raise AssertionError()')\n",
     ],
-    ids=["in a library that catches everything", "in an import"],
+    ids=["in a library that catches everything", "in an import", "in an import of a command that runs"],
 )
 def test_ctrl_c_during_an_import_is_a_line_and_status_130(tmp_path: Path, program: str) -> None:
-    done = started(tmp_path, program + "def main():\n    raise AssertionError('it went on')\n")
+    if "def main" not in program:
+        program += "def main():\n    raise AssertionError('it went on')\n"
+    done = started(tmp_path, "import bhd_lerobot.cli.start as s\n" + program)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
     assert done.stderr.startswith("Stopped before it began")
 

@@ -97,8 +97,8 @@ class BasePlant(Ros2Plant):
     def _turned(self, angles: NDArray[np.float64], measured_ns: int) -> NDArray[np.float64]:
         """Return how far the wheels have turned [rad], shape (2,), also after a new start of their driver.
 
-        After a silence, which stopped the robot, a count that no wheel can have reached is one from 0; what they
-        turned meanwhile is not known. Without a silence it is a false reading, and is passed on to the check of readings.
+        After a silence, which stopped the robot, a count that no wheel can have reached is one from 0; what they turned
+        meanwhile is not known. Without a silence it is a false reading, and is passed on to the check of readings.
         """
         if self._wheels is None:
             self._wheels, self._read_ns = angles.copy(), measured_ns
